@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from igaussian_core.camera import MODELS, Camera
 from igaussian_core.errors import CameraError
@@ -61,16 +62,16 @@ def camera_from_info(
     return Camera(
         roi_width // bin_x,
         roi_height // bin_y,
-        matrix[0, 0] / bin_x,
-        matrix[1, 1] / bin_y,
-        (matrix[0, 2] - x0 + 0.5) / bin_x - 0.5,
-        (matrix[1, 2] - y0 + 0.5) / bin_y - 0.5,
+        float(matrix[0, 0] / bin_x),
+        float(matrix[1, 1] / bin_y),
+        float((matrix[0, 2] - x0 + 0.5) / bin_x - 0.5),
+        float((matrix[1, 2] - y0 + 0.5) / bin_y - 0.5),
         model,
         dist,
     )
 
 
-def _matrix(name: str, values: Sequence[float] | None, count: int) -> np.ndarray:
+def _matrix(name: str, values: Sequence[float] | None, count: int) -> NDArray[np.float64]:
     array = np.asarray([] if values is None else values, np.float64).ravel()
     if array.size != count:
         raise CameraError(f"camera_info: {name} has {array.size} values, {count} wanted")
