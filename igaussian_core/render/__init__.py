@@ -1,0 +1,9 @@
+"""Rendering of 3D Gaussians on a CPU: a native kernel, and the slow torch reference it is tested
+against (`igaussian_core.render.reference`).
+"""
+
+from __future__ import annotations
+
+from igaussian_core.render.rasterizer import Rasterizer, Render, RenderStats, available_simd
+
+__all__ = ["Rasterizer", "Render", "RenderStats", "available_simd"]

@@ -1,0 +1,377 @@
+// Frames: cull, project and bin (threads over super blocks), then sort and blend (threads over
+// tiles). The C interface that Python loads is at the end.
+#include "renderer.h"
+
+#include <unistd.h>
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cmath>
+#include <cstring>
+#include <memory>
+#include <new>
+
+#include "pool.h"
+
+namespace igaussian {
+namespace {
+
+using Clock = std::chrono::steady_clock;
+
+int64_t since(Clock::time_point start) {
+  return std::chrono::duration_cast<std::chrono::nanoseconds>(Clock::now() - start).count();
+}
+
+// Memory that grows and is never zeroed, 64-byte aligned.
+template <class T>
+class Buffer {
+ public:
+  ~Buffer() { std::free(data_); }
+  T* at_least(size_t count) {
+    if (count > capacity_) {
+      std::free(data_);
+      capacity_ = 0;
+      const size_t wanted = count + count / 4;
+      data_ = static_cast<T*>(std::aligned_alloc(64, (wanted * sizeof(T) + 63) / 64 * 64));
+      if (!data_) throw std::bad_alloc();
+      capacity_ = wanted;
+    }
+    return data_;
+  }
+  T* data() { return data_; }
+
+ private:
+  T* data_ = nullptr;
+  size_t capacity_ = 0;
+};
+
+void free_arena(Arena* arena) {
+  for (Slab* slab = arena->first; slab;) {
+    Slab* next = slab->next;
+    std::free(slab);
+    slab = next;
+  }
+}
+
+// What one thread owns from frame to frame.
+struct Worker {
+  Bins bins{};
+  std::vector<TileList> tiles;
+  Buffer<uint64_t> keys, spare;
+  int64_t nanoseconds[3];
+  int64_t cells;
+  ~Worker() { free_arena(&bins.arena); }
+};
+
+View make_view(const Frame& f) {
+  View v;
+  v.width = f.width;
+  v.height = f.height;
+  v.fx = f.fx, v.fy = f.fy, v.cx = f.cx, v.cy = f.cy;
+  v.near_plane = f.near_plane;
+  const double* T = f.T_cam_scene;
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) v.R[i * 3 + j] = static_cast<float>(T[i * 4 + j]);
+    v.t[i] = static_cast<float>(T[i * 4 + 3]);
+    v.centre[i] = static_cast<float>(-(T[i] * T[3] + T[4 + i] * T[7] + T[8 + i] * T[11]));
+  }
+  // the image's edges lie half a pixel outside the outer pixel centres; 3DGS widens the field of
+  // view by 0.3 of its half before it clamps
+  const float half_x = 0.5f * f.width / f.fx, half_y = 0.5f * f.height / f.fy;
+  v.x_limit[0] = -(f.cx + 0.5f) / f.fx - 0.3f * half_x;
+  v.x_limit[1] = (f.width - 0.5f - f.cx) / f.fx + 0.3f * half_x;
+  v.y_limit[0] = -(f.cy + 0.5f) / f.fy - 0.3f * half_y;
+  v.y_limit[1] = (f.height - 0.5f - f.cy) / f.fy + 0.3f * half_y;
+  return v;
+}
+
+// A plane through the camera centre and one edge of the image; inside is positive.
+struct Plane {
+  float normal[3], offset;
+  float reach;  // how far past the plane a Gaussian of radius 1 still shows, Jacobian included
+  float pixel;  // distance of one pixel, at depth 1, from the plane
+};
+
+Plane edge_plane(const View& v, bool horizontal, bool far_edge) {
+  const float f = horizontal ? v.fx : v.fy, c = horizontal ? v.cx : v.cy;
+  const float size = static_cast<float>(horizontal ? v.width : v.height);
+  const float a = far_edge ? -f : f;                      // times x (or y)
+  const float b = far_edge ? size - 0.5f - c : c + 0.5f;  // times z
+  const float length = std::hypot(a, b);
+  const float* limit = horizontal ? v.x_limit : v.y_limit;
+  const float widest = std::max(std::fabs(limit[0]), std::fabs(limit[1]));
+  Plane p;
+  for (int k = 0; k < 3; ++k) {
+    p.normal[k] = (a * v.R[(horizontal ? 0 : 3) + k] + b * v.R[6 + k]) / length;
+  }
+  p.offset = (a * v.t[horizontal ? 0 : 1] + b * v.t[2]) / length;
+  p.reach = f * std::sqrt(1 + widest * widest) / length;
+  p.pixel = 1 / length;
+  return p;
+}
+
+float farthest(const float* normal, float offset, const Box& box) {
+  for (int k = 0; k < 3; ++k) {
+    offset += normal[k] * (normal[k] > 0 ? box.high[k] : box.low[k]);
+  }
+  return offset;
+}
+
+void cull(const Model& model, const View& view, std::vector<int32_t>* seen) {
+  seen->clear();
+  Plane planes[4];
+  for (int i = 0; i < 4; ++i) planes[i] = edge_plane(view, i < 2, i % 2);
+  constexpr float kLowPassPixels = 2.5f;  // sqrt(2 ln 255 * 0.3) and half a pixel, rounded up
+  for (int64_t s = 0; s < model.super_blocks; ++s) {
+    const Box& box = model.boxes[s];
+    if (!(box.low[0] <= box.high[0])) continue;
+    const float depth = farthest(view.R + 6, view.t[2], box);
+    bool inside = depth >= view.near_plane * 0.999f;
+    for (int i = 0; i < 4 && inside; ++i) {
+      const float slack =
+          box.radius * planes[i].reach * 1.001f + depth * planes[i].pixel * kLowPassPixels;
+      inside = farthest(planes[i].normal, planes[i].offset, box) >= -slack;
+    }
+    if (inside) seen->push_back(static_cast<int32_t>(s));
+  }
+}
+
+// One stable pass by 8 bits of (depth - least) >> shift.
+void radix_pass(const uint64_t* from, uint64_t* to, size_t n, uint32_t least, int shift) {
+  uint32_t starts[256] = {};
+  const auto digit = [&](uint64_t key) {
+    return ((static_cast<uint32_t>(key >> 32) - least) >> shift) & 255u;
+  };
+  for (size_t i = 0; i < n; ++i) ++starts[digit(from[i])];
+  uint32_t sum = 0;
+  for (uint32_t& start : starts) {
+    const uint32_t count = start;
+    start = sum;
+    sum += count;
+  }
+  for (size_t i = 0; i < n; ++i) to[starts[digit(from[i])]++] = from[i];
+}
+
+// Nearly sorted keys; gives up after too many moves.
+bool insertion_sort(uint64_t* keys, size_t n) {
+  size_t moves = 0;
+  for (size_t i = 1; i < n; ++i) {
+    const uint64_t key = keys[i];
+    size_t j = i;
+    for (; j > 0 && keys[j - 1] > key; --j) keys[j] = keys[j - 1];
+    keys[j] = key;
+    moves += i - j;
+    if (moves > 8 * n) return false;
+  }
+  return true;
+}
+
+// Exact order of (depth, number): two radix passes on 16 bits of the tile's depth range, then
+// insertion for what falls together.
+void sort_keys(uint64_t* keys, uint64_t* spare, size_t n) {
+  if (n < 48) {
+    std::sort(keys, keys + n);
+    return;
+  }
+  uint32_t least = ~0u, most = 0;
+  for (size_t i = 0; i < n; ++i) {
+    const uint32_t depth = static_cast<uint32_t>(keys[i] >> 32);
+    least = std::min(least, depth);
+    most = std::max(most, depth);
+  }
+  int shift = 0;
+  while ((most - least) >> shift >> 16) ++shift;
+  radix_pass(keys, spare, n, least, shift);
+  radix_pass(spare, keys, n, least, shift + 8);
+  if (!insertion_sort(keys, n)) std::sort(keys, keys + n);
+}
+
+}  // namespace
+
+class Renderer {
+ public:
+  Renderer(Model* model, const Kernel& kernel) : model_(model), kernel_(kernel) {}
+  ~Renderer() { free_model(model_); }
+  void render(Frame* frame);
+
+ private:
+  void prepare(const Frame& frame);
+  void project(int thread, const View& view);
+  void blend(int thread, const View& view, const Images& images);
+  Pool& pool(int threads);
+
+  Model* model_;
+  const Kernel& kernel_;
+  std::unique_ptr<Pool> pool_;
+  pid_t pool_process_ = 0;
+  std::vector<std::unique_ptr<Worker>> workers_;
+  std::vector<int32_t> seen_;
+  Buffer<Splat> splats_;
+  std::atomic<int> next_{0};
+  int tiles_x_ = 0, tiles_y_ = 0;
+};
+
+Pool& Renderer::pool(int threads) {
+  // threads do not survive a fork; the old pool's memory is given up in the child
+  if (pool_ && pool_process_ != getpid()) (void)pool_.release();
+  if (!pool_ || pool_->workers() != threads - 1) {
+    pool_.reset();
+    pool_ = std::make_unique<Pool>(threads - 1);
+    pool_process_ = getpid();
+  }
+  return *pool_;
+}
+
+void Renderer::prepare(const Frame& frame) {
+  tiles_x_ = (frame.width + kTile - 1) / kTile;
+  tiles_y_ = (frame.height + kTile - 1) / kTile;
+  const size_t tiles = static_cast<size_t>(tiles_x_) * tiles_y_;
+  while (workers_.size() < static_cast<size_t>(frame.threads)) {
+    workers_.push_back(std::make_unique<Worker>());
+  }
+  for (auto& worker : workers_) {
+    worker->tiles.assign(tiles, TileList{nullptr, nullptr});
+    Bins& bins = worker->bins;
+    bins.tiles = worker->tiles.data();
+    reset(&bins.arena);
+    bins.tiles_x = tiles_x_;
+    bins.tiles_y = tiles_y_;
+    bins.visible = bins.entries = worker->cells = 0;
+    bins.out_of_memory = false;
+    std::fill(worker->nanoseconds, worker->nanoseconds + 3, 0);
+  }
+}
+
+void Renderer::project(int thread, const View& view) {
+  const auto start = Clock::now();
+  Worker& worker = *workers_[thread];
+  for (;;) {
+    const int i = next_.fetch_add(1, std::memory_order_relaxed);
+    if (i >= static_cast<int>(seen_.size())) break;
+    const uint32_t first = static_cast<uint32_t>(i) * kSuperBlock;
+    kernel_.project(*model_, view, seen_[i], splats_.data() + first, first, &worker.bins);
+  }
+  worker.nanoseconds[0] += since(start);
+}
+
+void Renderer::blend(int thread, const View& view, const Images& images) {
+  Worker& worker = *workers_[thread];
+  const int tiles = tiles_x_ * tiles_y_;
+  auto start = Clock::now();
+  for (;;) {
+    const int tile = next_.fetch_add(1, std::memory_order_relaxed);
+    if (tile >= tiles) break;
+    size_t n = 0;
+    for (const auto& other : workers_) {
+      for (const Chunk* c = other->tiles[tile].head; c; c = c->next) n += c->size;
+    }
+    uint64_t* keys = worker.keys.at_least(n);
+    uint64_t* spare = worker.spare.at_least(n);
+    size_t filled = 0;
+    for (const auto& other : workers_) {
+      for (const Chunk* c = other->tiles[tile].head; c; c = c->next) {
+        std::memcpy(keys + filled, c->keys, c->size * sizeof(uint64_t));
+        filled += c->size;
+      }
+    }
+    sort_keys(keys, spare, n);
+    worker.bins.entries += n;
+    const auto sorted = Clock::now();
+    worker.nanoseconds[1] +=
+        std::chrono::duration_cast<std::chrono::nanoseconds>(sorted - start).count();
+    worker.cells += kernel_.blend(view, splats_.data(), keys, static_cast<int64_t>(n),
+                                  tile % tiles_x_, tile / tiles_x_, images);
+    start = Clock::now();
+    worker.nanoseconds[2] +=
+        std::chrono::duration_cast<std::chrono::nanoseconds>(start - sorted).count();
+  }
+}
+
+void Renderer::render(Frame* frame) {
+  frame->threads = std::max(1, std::min(frame->threads, kMaxThreads));
+  const View view = make_view(*frame);
+  prepare(*frame);
+  cull(*model_, view, &seen_);
+  splats_.at_least(seen_.size() * kSuperBlock);
+  Pool& threads = pool(frame->threads);
+  std::atomic<bool> failed{false};
+  const auto guarded = [&](auto&& job) {
+    next_ = 0;
+    threads.run([&](int thread) {
+      try {
+        job(thread);
+      } catch (const std::bad_alloc&) {
+        failed = true;
+      }
+    });
+  };
+  guarded([&](int thread) { project(thread, view); });
+  for (const auto& worker : workers_) failed = failed || worker->bins.out_of_memory;
+  if (failed) throw std::bad_alloc();
+  const Images images = {frame->rgb,
+                         frame->depth,
+                         frame->alpha,
+                         frame->median_depth,
+                         frame->ids,
+                         {frame->background[0], frame->background[1], frame->background[2]}};
+  guarded([&](int thread) { blend(thread, view, images); });
+  if (failed) throw std::bad_alloc();
+  std::fill(frame->nanoseconds, frame->nanoseconds + 3, 0);
+  frame->visible = frame->entries = frame->cells = 0;
+  for (const auto& worker : workers_) {
+    for (int k = 0; k < 3; ++k) frame->nanoseconds[k] += worker->nanoseconds[k];
+    frame->visible += worker->bins.visible;
+    frame->entries += worker->bins.entries;
+    frame->cells += worker->cells;
+  }
+}
+
+namespace {
+
+const Kernel* find_kernel(const char* name) {
+#ifdef IGAUSSIAN_X86
+  if (!std::strcmp(name, "avx512") && __builtin_cpu_supports("avx512f") &&
+      __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") &&
+      __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("bmi2")) {
+    return &kAvx512Kernel;
+  }
+  // every CPU with AVX2 and FMA also has F16C
+  if (!std::strcmp(name, "avx2") && __builtin_cpu_supports("avx2") &&
+      __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2")) {
+    return &kAvx2Kernel;
+  }
+#endif
+  return std::strcmp(name, "portable") ? nullptr : &kPortableKernel;
+}
+
+}  // namespace
+}  // namespace igaussian
+
+using namespace igaussian;
+
+#define IGAUSSIAN_API extern "C" __attribute__((visibility("default")))
+
+IGAUSSIAN_API int igaussian_abi() { return 1; }
+
+// 1 where this CPU runs the instruction set "avx512", "avx2" or "portable".
+IGAUSSIAN_API int igaussian_supports(const char* simd) { return find_kernel(simd) != nullptr; }
+
+IGAUSSIAN_API void* igaussian_create(const Gaussians* gaussians, int antialiased,
+                                     const char* simd) {
+  const Kernel* kernel = find_kernel(simd);
+  if (!kernel) return nullptr;
+  Model* model = pack_model(*gaussians, antialiased != 0, kernel->half_sh);
+  return model ? new (std::nothrow) Renderer(model, *kernel) : nullptr;
+}
+
+IGAUSSIAN_API void igaussian_destroy(void* renderer) { delete static_cast<Renderer*>(renderer); }
+
+IGAUSSIAN_API int igaussian_render(void* renderer, Frame* frame) {
+  try {
+    static_cast<Renderer*>(renderer)->render(frame);
+    return kOk;
+  } catch (...) {
+    return kOutOfMemory;
+  }
+}

@@ -1,0 +1,151 @@
+// Data shared by every instruction set's kernel and by the driver.
+//
+// Kernel translation units are compiled with flags of their own, so nothing here may emit a weak
+// symbol: plain structs and static functions only, or the linker could pick an AVX-512 copy of a
+// function that an older CPU then runs.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+#include <cstdlib>
+
+namespace igaussian {
+
+constexpr int kBlock = 16;        // Gaussians stored side by side (structure of arrays)
+constexpr int kSuperBlock = 256;  // Gaussians culled by one frustum test
+constexpr int kTile = 32;         // pixels a side of a tile
+constexpr int kCell = 4;          // pixels a side of a cell; a tile is 8x8 cells
+constexpr int kCells = 64;        // cells in a tile: one bit each of a 64-bit mask
+constexpr int kPixels = 16;       // pixels in a cell
+
+constexpr float kLog2AlphaMin = -7.994353436858858f;  // log2(1/255)
+constexpr float kAlphaMax = 0.99f;
+constexpr float kStop = 1e-4f;     // a pixel is finished when its transmittance falls below
+constexpr float kLowPass = 0.3f;   // pixels^2 added to each projected covariance
+
+// One axis-aligned box of 256 Gaussians.
+struct Box {
+  float low[3], high[3];
+  float radius;  // largest distance from a mean at which alpha still reaches 1/255
+};
+
+// A scene packed for the kernels; arrays are 64-byte aligned, in blocks of kBlock.
+struct Model {
+  int64_t count;         // real Gaussians; the last block is padded with invisible ones
+  int64_t super_blocks;
+  int degree;            // spherical harmonics, 0 to 3
+  bool antialiased;
+  bool half_sh;          // sh holds fp16, otherwise float
+  float* mean;           // [block][3][16]
+  float* factor;         // [block][9][16], rows of rotation * diag(scale)
+  float* log_opacity;    // [block][16], log2
+  void* sh;              // [block][K * 3][16]
+  int32_t* index;        // [block][16], index in the caller's arrays
+  Box* boxes;            // [super_blocks]
+};
+
+// One camera, intrinsics with the first pixel's centre at (0, 0).
+struct View {
+  int width, height;
+  float fx, fy, cx, cy;
+  float R[9], t[3];      // x_cam = R x_scene + t
+  float centre[3];       // camera centre in the scene
+  float near_plane;
+  float x_limit[2], y_limit[2];  // clamp of x/z and y/z in the Jacobian
+};
+
+// A projected Gaussian, one cache line. log2(alpha) at offset (dx, dy) from (u, v) is
+// a dx^2 + b dx dy + c dy^2 + log_opacity.
+struct alignas(64) Splat {
+  float u, v, a, b, c, log_opacity;
+  float red, green, blue, z;
+  // the ellipse alpha = 1/255 spans slope * dy +- sqrt(root0 + root2 dy^2) at height dy,
+  // and is widest at dy = +-dy_right
+  float slope, root0, root2, dy_right;
+  int32_t index;
+  float unused;
+};
+static_assert(sizeof(Splat) == 64, "one cache line");
+
+struct Chunk {
+  static constexpr int kKeys = 62;
+  uint64_t keys[kKeys];  // depth bits << 32 | splat number
+  Chunk* next;
+  int64_t size;
+};
+static_assert(sizeof(Chunk) == 512, "eight cache lines");
+
+struct TileList {
+  Chunk *head, *tail;
+};
+
+// Chunks handed out one by one and taken back all at once; the slabs stay for the next frame.
+struct Slab {
+  static constexpr int kChunks = 255;
+  Slab* next;
+  alignas(64) Chunk chunks[kChunks];
+};
+
+struct Arena {
+  Slab *first, *current;
+  int used;  // chunks taken from the current slab
+};
+
+// Null when memory has run out.
+static inline Chunk* take_chunk(Arena* arena) {
+  if (arena->current == nullptr || arena->used == Slab::kChunks) {
+    Slab** link = arena->current ? &arena->current->next : &arena->first;
+    if (*link == nullptr) {
+      *link = static_cast<Slab*>(std::aligned_alloc(64, sizeof(Slab)));
+      if (*link == nullptr) return nullptr;
+      (*link)->next = nullptr;
+    }
+    arena->current = *link;
+    arena->used = 0;
+  }
+  Chunk* chunk = &arena->current->chunks[arena->used++];
+  chunk->next = nullptr;
+  chunk->size = 0;
+  return chunk;
+}
+
+static inline void reset(Arena* arena) {
+  arena->current = nullptr;
+  arena->used = 0;
+}
+
+// What one thread collects while it projects.
+struct Bins {
+  TileList* tiles;  // [tiles_y * tiles_x]
+  Arena arena;
+  int tiles_x, tiles_y;
+  int64_t visible, entries;
+  bool out_of_memory;
+};
+
+// Where a tile's pixels go. Pointers may be null where the caller did not ask.
+struct Images {
+  float *rgb, *depth, *alpha, *median_depth;
+  int32_t* ids;
+  float background[3];
+};
+
+// The functions of one instruction set.
+struct Kernel {
+  const char* name;
+  bool half_sh;
+  // Projects super block number `block` into splats[0..255], files their keys (numbered from
+  // first_splat) under the tiles they touch.
+  void (*project)(const Model&, const View&, int64_t block, Splat* splats, uint32_t first_splat,
+                  Bins*);
+  // Blends one tile front to back; keys are sorted. Returns the number of cells evaluated.
+  int64_t (*blend)(const View&, const Splat*, const uint64_t* keys, int64_t n, int tile_x,
+                   int tile_y, const Images&);
+};
+
+extern const Kernel kPortableKernel;
+#ifdef IGAUSSIAN_X86
+extern const Kernel kAvx2Kernel;
+extern const Kernel kAvx512Kernel;
+#endif
+
+}  // namespace igaussian

@@ -1,0 +1,241 @@
+"""`Rasterizer`: one map packed for the native kernel, and the frames rendered from it."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import weakref
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from igaussian_core.camera import Camera
+from igaussian_core.errors import CameraError, IGaussianError, MapError
+from igaussian_core.render import native_library as native
+from igaussian_core.render.native_library import available_simd
+
+__all__ = ["DEFAULT_NEAR", "OUTPUTS", "Rasterizer", "Render", "RenderStats", "available_simd"]
+
+OUTPUTS = ("rgb", "depth", "alpha", "median_depth", "ids")
+# 3DGS cuts at 0.2 of a unit, which is 20 cm in a metric map: a robot stands closer to things
+DEFAULT_NEAR = 0.01
+MAX_SIDE = 1 << 15
+
+
+class Render(NamedTuple):
+    """Images of one view; None where an output was not asked for.
+
+    Attributes:
+        rgb: float32 [H, W, 3], 0 to 1 and above where the map's colours are, over background.
+        depth: float32 [H, W], expected depth: camera-frame z in scene units, weighted by each
+            Gaussian's contribution and divided by alpha; 0 where alpha is 0.
+        alpha: float32 [H, W], 0 to 1.
+        median_depth: float32 [H, W], z of the Gaussian at which alpha reaches 0.5; 0 where it
+            never does.
+        ids: int32 [H, W], index of the Gaussian that contributes most; -1 where none does.
+    """
+
+    rgb: NDArray[np.float32] | None
+    depth: NDArray[np.float32] | None
+    alpha: NDArray[np.float32] | None
+    median_depth: NDArray[np.float32] | None = None
+    ids: NDArray[np.int32] | None = None
+
+
+class RenderStats(NamedTuple):
+    """What the last frame cost.
+
+    Attributes:
+        project_ms, sort_ms, blend_ms: busy time summed over threads.
+        visible: Gaussians that reach the image.
+        entries: (Gaussian, tile) pairs sorted.
+        cells: (Gaussian, 4x4 pixels) pairs blended.
+    """
+
+    project_ms: float
+    sort_ms: float
+    blend_ms: float
+    visible: int
+    entries: int
+    cells: int
+
+
+class Rasterizer:
+    """A map of 3D Gaussians, ready to be rendered; later changes of the arrays have no effect.
+
+    One thread at a time may render with one Rasterizer: frames share its buffers. Use several
+    Rasterizers to render from several threads.
+
+    Args:
+        means: float32 [N, 3], scene frame.
+        quats_wxyz: float32 [N, 4], rotation of each Gaussian's axes into the scene, any length.
+        scales: float32 [N, 3], standard deviations along the axes, scene units (not logarithms).
+        opacities: float32 [N], 0 to 1.
+        sh: float32 [N, K, 3], K = 1, 4, 9 or 16 spherical harmonics; colour = SH + 0.5, at least 0.
+        antialiased: scale opacities by sqrt(det S / det (S + 0.3 I)), S the projected covariance,
+            for maps trained so (gsplat's "antialiased", after Mip-Splatting).
+        simd: instruction set, one of available_simd(); None: IGAUSSIAN_SIMD or the fastest.
+
+    Raises:
+        MapError: shapes that do not fit, values that are not finite, opacities outside [0, 1].
+        IGaussianError: the instruction set is not available, the library is not built.
+    """
+
+    def __init__(
+        self,
+        means: ArrayLike,
+        quats_wxyz: ArrayLike,
+        scales: ArrayLike,
+        opacities: ArrayLike,
+        sh: ArrayLike,
+        antialiased: bool = False,
+        simd: str | None = None,
+    ) -> None:
+        arrays = _checked(means, quats_wxyz, scales, opacities, sh)
+        self.count = len(arrays[0])
+        self.sh_degree = {1: 0, 4: 1, 9: 2, 16: 3}[arrays[4].shape[1]]
+        self.antialiased = antialiased
+        self.simd = native.choose_simd(simd)
+        self.stats: RenderStats | None = None
+        packed = native.Gaussians(
+            self.count, arrays[4].shape[1], *(_pointer(array) for array in arrays)
+        )
+        lib = native.library()
+        self._handle = lib.igaussian_create(
+            ctypes.byref(packed), int(antialiased), self.simd.encode()
+        )
+        if not self._handle:
+            raise IGaussianError(f"renderer: no memory for {self.count} Gaussians")
+        weakref.finalize(self, lib.igaussian_destroy, self._handle)
+
+    def render(
+        self,
+        camera: Camera,
+        T_cam_scene: ArrayLike,
+        *,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        near: float = DEFAULT_NEAR,
+        threads: int | None = None,
+        outputs: Collection[str] = ("rgb", "depth", "alpha"),
+    ) -> Render:
+        """Images seen by a pinhole camera.
+
+        Args:
+            camera: pinhole; pixel (0, 0) has its centre at (0, 0), as cx and cy do.
+            T_cam_scene: float64 4x4, rigid, scene to the camera's optical frame.
+            background: RGB behind the map.
+            near: Gaussians whose centre has z <= near are not drawn.
+            threads: None takes every CPU that this process may use. The result does not depend
+                on it.
+            outputs: names of Render's fields that are wanted.
+
+        Raises:
+            CameraError: the camera has distortion (use camera.undistorted()), the image is larger
+                than 32768 pixels a side, or T_cam_scene is not a rigid transform.
+        """
+        _check_camera(camera)
+        frame = native.Frame(
+            width=camera.width,
+            height=camera.height,
+            threads=threads or default_threads(),
+            fx=camera.fx,
+            fy=camera.fy,
+            cx=camera.cx,
+            cy=camera.cy,
+            near_plane=near,
+            T_cam_scene=(ctypes.c_double * 16)(*_rigid(T_cam_scene).ravel()),
+            background=(ctypes.c_float * 3)(*background),
+        )
+        images = _allocate(camera, outputs)
+        for name, image in images.items():
+            setattr(frame, name, _pointer(image))
+        if native.library().igaussian_render(self._handle, ctypes.byref(frame)):
+            raise IGaussianError(
+                f"renderer: no memory for {camera.width}x{camera.height} of {self.count} Gaussians"
+            )
+        self.stats = RenderStats(
+            *(nanoseconds * 1e-6 for nanoseconds in frame.nanoseconds),
+            frame.visible,
+            frame.entries,
+            frame.cells,
+        )
+        return Render(*(images.get(name) for name in OUTPUTS))
+
+
+def default_threads() -> int:
+    """CPUs that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _pointer(array: NDArray[np.generic]) -> ctypes._Pointer:  # type: ignore[type-arg]
+    kind = ctypes.c_int32 if array.dtype == np.int32 else ctypes.c_float
+    return ctypes.cast(array.ctypes.data, ctypes.POINTER(kind))
+
+
+def _checked(*arrays: ArrayLike) -> list[NDArray[np.float32]]:
+    names = ("means", "quats_wxyz", "scales", "opacities", "sh")
+    result = [np.ascontiguousarray(array, np.float32) for array in arrays]
+    count = len(result[0]) if result[0].ndim else 0
+    shapes: list[tuple[int, ...]] = [(count, 3), (count, 4), (count, 3), (count,)]
+    for name, array, shape in zip(names, result, shapes, strict=False):
+        if array.shape != shape:
+            raise MapError(f"renderer: {name} has shape {array.shape}, expected {shape}")
+    sh = result[4]
+    if sh.ndim != 3 or len(sh) != count or sh.shape[1] not in (1, 4, 9, 16) or sh.shape[2] != 3:
+        raise MapError(
+            f"renderer: sh has shape {sh.shape}, expected ({count}, K, 3) with K in 1, 4, 9, 16"
+        )
+    for name, array in zip(names, result, strict=True):
+        bad = array.size - int(np.isfinite(array).sum())
+        if bad:
+            raise MapError(f"renderer: {bad} values of {name} are not finite")
+    if count and (result[3].min() < 0 or result[3].max() > 1):
+        raise MapError(
+            f"renderer: opacities from {result[3].min():g} to {result[3].max():g}, "
+            "expected 0 to 1 (not logits)"
+        )
+    return result
+
+
+def _check_camera(camera: Camera) -> None:
+    if not camera.is_pinhole:
+        raise CameraError(
+            f"renderer: the camera has {camera.model} distortion; "
+            "render with camera.undistorted()"
+        )
+    if max(camera.width, camera.height) > MAX_SIDE:
+        raise CameraError(
+            f"renderer: {camera.width}x{camera.height} is larger than {MAX_SIDE} pixels a side"
+        )
+
+
+def _rigid(T: ArrayLike) -> NDArray[np.float64]:
+    matrix = np.ascontiguousarray(T, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise CameraError(f"renderer: T_cam_scene must be a finite 4x4 matrix, got\n{matrix}")
+    R = matrix[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise CameraError(f"renderer: T_cam_scene is not a rigid transform:\n{matrix}")
+    return matrix
+
+
+def _allocate(
+    camera: Camera, outputs: Collection[str]
+) -> dict[str, NDArray[np.float32] | NDArray[np.int32]]:
+    unknown = set(outputs) - set(OUTPUTS)
+    if unknown:
+        raise IGaussianError(
+            f"renderer: unknown outputs {sorted(unknown)}; supported: {', '.join(OUTPUTS)}"
+        )
+    size = (camera.height, camera.width)
+    images: dict[str, NDArray[np.float32] | NDArray[np.int32]] = {}
+    for name in outputs:
+        if name == "ids":
+            images[name] = np.empty(size, np.int32)
+        else:
+            images[name] = np.empty((*size, 3) if name == "rgb" else size, np.float32)
+    return images
