@@ -1,0 +1,1 @@
+"""Stage one: where roughly is the camera?"""

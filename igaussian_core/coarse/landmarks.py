@@ -1,0 +1,93 @@
+"""Hypotheses from the landmarks of a compiled map: 2D-3D matches against source views."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from igaussian_core.camera import Camera
+from igaussian_core.config import CoarseConfig
+from igaussian_core.features import Features, mutual_matches
+from igaussian_core.hypothesis import Hypothesis
+from igaussian_core.map_package import Landmarks
+from igaussian_core.pnp import solve_pnp
+
+
+class LandmarkLocalizer:
+    """Ranks the source views by mutual matches, then PnP over the best views' matches.
+
+    Args:
+        landmarks: of the compiled map.
+        config: stage one.
+        min_similarity: least cosine similarity of a match, the matcher's.
+    """
+
+    def __init__(self, landmarks: Landmarks, config: CoarseConfig, min_similarity: float) -> None:
+        self._landmarks = landmarks
+        self._config = config
+        self._min_similarity = min_similarity
+        self._rank_descriptors = _best_of_each_view(landmarks, config.rank_landmarks)
+
+    def hypotheses(self, features: Features, camera: Camera) -> Iterator[Hypothesis]:
+        """Poses in order of their inliers, at most `config.hypotheses`; found as asked for.
+
+        Args:
+            features: the frame's, best score first.
+            camera: its pinhole camera.
+        """
+        views = self.rank_views(features)[: self._config.top_views]
+        query, points = self._matches(features, views)
+        for _ in range(self._config.hypotheses):
+            uv = features.uv[query]
+            solution = solve_pnp(camera, uv, points, self._config.max_reprojection_px)
+            if solution is None or solution.inliers.sum() < self._config.min_inliers:
+                return
+            yield Hypothesis(
+                solution.T_scene_cam, float(solution.inliers.sum()), "landmarks"
+            )
+            # what the first pose does not explain may tell of another place
+            query, points = query[~solution.inliers], points[~solution.inliers]
+
+    def rank_views(self, features: Features) -> NDArray[np.int64]:
+        """Source views by falling number of mutual matches with the frame's best keypoints."""
+        query = torch.from_numpy(features.descriptors[: self._config.rank_keypoints])
+        if len(query) == 0:
+            return np.zeros(0, np.int64)
+        counts = [
+            _count_mutual(query, view, self._min_similarity) for view in self._rank_descriptors
+        ]
+        return np.argsort(-np.array(counts), kind="stable").astype(np.int64)
+
+    def _matches(
+        self, features: Features, views: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Query indices [M] and landmark points [M, 3] matched over several views."""
+        query, points = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
+        for view in views:
+            part = slice(*self._landmarks.offsets[view : view + 2])
+            pairs = mutual_matches(
+                features.descriptors, self._landmarks.descriptors[part], self._min_similarity
+            )
+            query.append(pairs[:, 0])
+            points.append(self._landmarks.points[part][pairs[:, 1]].astype(np.float64))
+        return np.concatenate(query), np.concatenate(points)
+
+
+def _best_of_each_view(landmarks: Landmarks, count: int) -> list[torch.Tensor]:
+    return [
+        torch.from_numpy(landmarks.descriptors[start : min(start + count, stop)])
+        for start, stop in zip(landmarks.offsets[:-1], landmarks.offsets[1:], strict=True)
+    ]
+
+
+def _count_mutual(a: torch.Tensor, b: torch.Tensor, min_similarity: float) -> int:
+    """Number of mutual nearest neighbours above a similarity."""
+    if len(b) == 0:
+        return 0
+    similarity = a @ b.T
+    value, best = similarity.max(1)
+    back = similarity.argmax(0)
+    return int(((back[best] == torch.arange(len(a))) & (value > min_similarity)).sum())

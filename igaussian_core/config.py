@@ -1,0 +1,214 @@
+"""Every default of the system, typed, frozen and nested by stage.
+
+The command line, the ROS node and the tests all read this file; nothing else holds a default.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from igaussian_core.errors import ConfigError
+
+
+def _option(
+    default: Any,
+    help: str,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """A field with its description and its allowed range or choices."""
+    return field(
+        default=default, metadata={"help": help, "low": low, "high": high, "choices": choices}
+    )
+
+
+@dataclass(frozen=True)
+class ImageConfig:
+    """What is done to a frame before anything looks at it."""
+
+    max_side: int = _option(640, "longer image side in pixels after shrinking", 64, 4096)
+    min_contrast: float = _option(
+        4.0, "standard deviation of grey levels below which a frame is too dark or flat", 0, 127
+    )
+
+
+@dataclass(frozen=True)
+class FeatureConfig:
+    """Keypoints and matcher of both stages; a compiled map holds those it was made with."""
+
+    matcher: str = _option(
+        "xfeat",
+        "xfeat (XFeat + LighterGlue) or sift; sift is taken where the weights are missing",
+        choices=("xfeat", "sift"),
+    )
+    keypoints: int = _option(1024, "keypoints a frame", 64, 8192)
+
+
+@dataclass(frozen=True)
+class CoarseConfig:
+    """Stage one: landmarks compiled from the map."""
+
+    rank_keypoints: int = _option(384, "query keypoints that rank the source views", 32, 4096)
+    rank_landmarks: int = _option(384, "landmarks of each source view used in ranking", 32, 4096)
+    top_views: int = _option(8, "source views matched in full", 1, 64)
+    max_reprojection_px: float = _option(8.0, "inlier threshold of landmark PnP in pixels", 0.5, 64)
+    min_inliers: int = _option(12, "least inliers of a hypothesis", 4, 1000)
+    hypotheses: int = _option(3, "hypotheses handed to stage two", 1, 16)
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """Stage two: match the image with a render at the hypothesis, PnP with rendered depth."""
+
+    rounds: int = _option(3, "most renders a hypothesis gets", 1, 8)
+    converged_deg: float = _option(1.0, "a rotation step below this needs no new render", 0, 45)
+    converged_rel: float = _option(
+        0.03, "a translation step below this share of the median depth needs no new render", 0, 1
+    )
+    max_reprojection_px: float = _option(3.0, "inlier threshold of PnP in pixels", 0.25, 32)
+    min_alpha: float = _option(0.8, "least alpha of a render's pixel that is lifted to 3D", 0, 1)
+    max_depth_step: float = _option(
+        0.1, "relative depth change within 2 px above which a pixel is an edge", 0, 1
+    )
+
+
+@dataclass(frozen=True)
+class VerifyConfig:
+    """What a pose must show to be accepted; fixed from held-out photos, see docs/accuracy.md."""
+
+    min_inliers_xfeat: int = _option(40, "least PnP inliers with XFeat + LighterGlue", 4, 1000)
+    min_ratio_xfeat: float = _option(0.35, "least inlier ratio with XFeat + LighterGlue", 0, 1)
+    min_inliers_sift: int = _option(25, "least PnP inliers with SIFT", 4, 1000)
+    min_ratio_sift: float = _option(0.25, "least inlier ratio with SIFT", 0, 1)
+    max_residual_px: float = _option(2.0, "largest median reprojection error of inliers", 0.1, 16)
+    min_coverage: float = _option(
+        0.05, "least share of the render's pixels that the map covers (alpha)", 0, 1
+    )
+    min_spread: float = _option(
+        0.05, "least share of the image's area that the inliers' spread covers", 0, 1
+    )
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """How the last accepted pose serves as the next frame's prior."""
+
+    enabled: bool = _option(True, "use the last pose, with odometry where there is some, as prior")
+    max_gap_s: float = _option(2.0, "age above which the last pose is no prior any more", 0, 60)
+
+
+@dataclass(frozen=True)
+class RuntimeConfig:
+    """The machine."""
+
+    threads: int = _option(2, "threads of networks and renderer", 1, 256)
+    max_image_age_s: float = _option(1.0, "frames older than this when work starts are dropped", 0, 60)
+
+
+@dataclass(frozen=True)
+class Config:
+    """The whole configuration, one group a stage."""
+
+    image: ImageConfig = field(default_factory=ImageConfig)
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    coarse: CoarseConfig = field(default_factory=CoarseConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    verify: VerifyConfig = field(default_factory=VerifyConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
+
+    @staticmethod
+    def from_flat(values: Mapping[str, Any]) -> Config:
+        """Config from dotted names, e.g. {"refine.rounds": 2}; the rest stays at its default.
+
+        Raises:
+            ConfigError: an unknown name, a wrong type, a value out of range.
+        """
+        known = options()
+        groups: dict[str, dict[str, Any]] = {}
+        for name, value in values.items():
+            if name not in known:
+                raise ConfigError(f"config: unknown key '{name}'; known: {', '.join(known)}")
+            group, key = name.split(".")
+            groups.setdefault(group, {})[key] = _checked(name, value, known[name])
+        parts = {
+            f.name: dataclasses.replace(f.default_factory(), **groups.get(f.name, {}))
+            for f in dataclasses.fields(Config)
+            if not isinstance(f.default_factory, type(dataclasses.MISSING))
+        }
+        return Config(**parts)
+
+    @staticmethod
+    def from_file(path: str | Path) -> Config:
+        """Config from a JSON file, nested by group as `to_json` writes it.
+
+        Raises:
+            ConfigError: unreadable, no JSON object, or as in `from_flat`.
+        """
+        try:
+            data = json.loads(Path(path).read_text())
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{path}: no configuration: {error}") from error
+        if not isinstance(data, dict) or not all(isinstance(v, dict) for v in data.values()):
+            raise ConfigError(f"{path}: expected an object of groups, e.g. {{'refine': {{...}}}}")
+        return Config.from_flat({f"{g}.{k}": v for g, part in data.items() for k, v in part.items()})
+
+    def to_flat(self) -> dict[str, Any]:
+        """Dotted names to values, in the order of this file."""
+        return {
+            f"{group}.{key}": value
+            for group, part in dataclasses.asdict(self).items()
+            for key, value in part.items()
+        }
+
+    def to_json(self) -> str:
+        """Nested by group; what is written beside results."""
+        return json.dumps(dataclasses.asdict(self), indent=1)
+
+
+@dataclass(frozen=True)
+class Option:
+    """Description of one configuration value, for the node's parameters and the docs."""
+
+    type: type
+    default: Any
+    help: str
+    low: float | None
+    high: float | None
+    choices: tuple[str, ...]
+
+
+def options() -> dict[str, Option]:
+    """Every option by its dotted name."""
+    result: dict[str, Option] = {}
+    for group_name, group_type in typing.get_type_hints(Config).items():
+        hints = typing.get_type_hints(group_type)
+        for f in dataclasses.fields(group_type):
+            m: types.MappingProxyType[Any, Any] = f.metadata
+            result[f"{group_name}.{f.name}"] = Option(
+                hints[f.name], f.default, m["help"], m["low"], m["high"], m["choices"]
+            )
+    return result
+
+
+def _checked(name: str, value: Any, option: Option) -> Any:
+    """The value in its own type, or ConfigError."""
+    if option.type is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not option.type:
+        raise ConfigError(
+            f"config: {name} must be {option.type.__name__}, got {type(value).__name__} {value!r}"
+        )
+    if option.choices and value not in option.choices:
+        raise ConfigError(f"config: {name}='{value}' is none of {', '.join(option.choices)}")
+    if option.low is not None and not option.low <= value <= (option.high or float("inf")):
+        raise ConfigError(f"config: {name}={value} is outside [{option.low}, {option.high}]")
+    return value

@@ -1,0 +1,212 @@
+"""The pipeline: one image in, one pose with its evidence out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from igaussian_core.camera import Camera
+from igaussian_core.coarse.landmarks import LandmarkLocalizer
+from igaussian_core.config import Config
+from igaussian_core.errors import CameraError, MapError
+from igaussian_core.features import Features, Matcher, make_matcher
+from igaussian_core.geometry import Sim3, is_rigid
+from igaussian_core.hypothesis import Hypothesis
+from igaussian_core.map_package import Manifest, MapPackage, open_package
+from igaussian_core.refine.refiner import Refinement, Refiner
+from igaussian_core.refine.verify import judge
+from igaussian_core.result import LocalizationResult, Status
+from igaussian_core.timing import StageTimer
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+
+class Localizer:
+    """Localizes images in one compiled map. For one thread at a time.
+
+    Args:
+        package: the compiled map.
+        config: the whole configuration; its defaults where None.
+    """
+
+    def __init__(self, package: MapPackage, config: Config | None = None) -> None:
+        self._config = config or Config()
+        self._package = package
+        self._T_map_scene = package.T_map_scene
+        self._matcher = _matcher_of(package, self._config)
+        torch.set_num_threads(self._config.runtime.threads)
+        self._landmarks = LandmarkLocalizer(
+            package.landmarks, self._config.coarse, self._matcher.min_similarity
+        )
+        self._refiner = Refiner(
+            self._render_scene, self._matcher, self._config.refine, self._config.features.keypoints
+        )
+
+    @staticmethod
+    def open(path: str | os.PathLike[str], config: Config | None = None) -> Localizer:
+        """Localizer of a compiled map directory.
+
+        Raises:
+            MapError: no compiled map, of a newer version, or altered.
+        """
+        return Localizer(open_package(path), config)
+
+    @property
+    def manifest(self) -> Manifest:
+        return self._package.manifest
+
+    @property
+    def T_map_scene(self) -> Sim3:
+        return self._T_map_scene
+
+    def localize(
+        self, image: NDArray[np.uint8], camera: Camera, prior: ArrayLike | None = None
+    ) -> LocalizationResult:
+        """Where is the camera?
+
+        Args:
+            image: uint8 RGB [H, W, 3].
+            camera: of that size, distortion included.
+            prior: T_map_cam [4, 4] where the camera probably is; it is tried first, the
+                landmarks after it. None: from nothing.
+
+        Returns:
+            A pose, or a status that says why there is none. Never the prior itself.
+
+        Raises:
+            CameraError: the image is not uint8 RGB of the camera's size; a prior that is no
+                rigid transform.
+        """
+        timer = StageTimer()
+        with timer("prepare"):
+            image, camera = self._prepare(image, camera)
+        if (contrast := _contrast(image)) < self._config.image.min_contrast:
+            reason = f"contrast {contrast:.1f} grey levels"
+            return LocalizationResult(
+                Status.TOO_DARK_OR_BLURRED, reason, timings_ms=timer.timings_ms()
+            )
+        with timer("extract"):
+            features = self._matcher.extract(image, self._config.features.keypoints)
+
+        failure = LocalizationResult(
+            Status.NO_HYPOTHESIS, "no place in the map resembles the image", source="landmarks"
+        )
+        for hypothesis in self._hypotheses(features, camera, prior, timer):
+            refinement = self._refiner.refine(features, camera, hypothesis.T_scene_cam, timer)
+            result = self._result(hypothesis, refinement)
+            if result.ok:
+                return _timed(result, timer)
+            if result.inliers >= failure.inliers:
+                failure = result
+        return _timed(failure, timer)
+
+    def render(self, camera: Camera, T_map_cam: ArrayLike) -> tuple[Image, Image, Image]:
+        """RGB [H, W, 3], depth [H, W] in metres and alpha [H, W] of the map at a pose.
+
+        Raises:
+            CameraError: the camera has distortion.
+        """
+        T_scene_cam = self._T_map_scene.inverse().camera(T_map_cam)
+        rgb, depth, alpha = self._render_scene(camera, T_scene_cam)
+        return rgb, depth * np.float32(self._T_map_scene.scale), alpha
+
+    def _prepare(
+        self, image: NDArray[np.uint8], camera: Camera
+    ) -> tuple[NDArray[np.uint8], Camera]:
+        """The frame without distortion, no larger than configured."""
+        camera.check_image(image)
+        small = camera.scaled_to_fit(self._config.image.max_side)
+        if small != camera:
+            size = (small.width, small.height)
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return small.undistort(image)
+
+    def _hypotheses(
+        self, features: Features, camera: Camera, prior: ArrayLike | None, timer: StageTimer
+    ) -> Iterator[Hypothesis]:
+        """Stage one: the prior, then places that the landmarks know; found as asked for."""
+        if prior is not None:
+            if not is_rigid(prior):
+                raise CameraError("prior: expected a rigid 4x4 transform T_map_cam")
+            yield Hypothesis(self._T_map_scene.inverse().camera(prior), 0.0, "prior")
+        candidates = self._landmarks.hypotheses(features, camera)
+        while True:
+            with timer("coarse"):
+                hypothesis = next(candidates, None)
+            if hypothesis is None:
+                return
+            yield hypothesis
+
+    def _result(self, hypothesis: Hypothesis, refinement: Refinement) -> LocalizationResult:
+        evidence = refinement.evidence
+        status, reason = judge(evidence, self._matcher.name, self._config.verify)
+        T_map_cam = covariance = None
+        if status.ok and refinement.T_scene_cam is not None:
+            T_map_cam = self._T_map_scene.camera(refinement.T_scene_cam)
+            covariance = _covariance_in_map(refinement, self._T_map_scene)
+        return LocalizationResult(
+            status=status,
+            reason=reason,
+            T_map_cam=T_map_cam,
+            covariance=covariance,
+            inliers=evidence.inliers,
+            matches=evidence.matches,
+            inlier_ratio=evidence.ratio,
+            residual_px=evidence.residual_px,
+            coverage=evidence.coverage,
+            matcher=self._matcher.name,
+            source=hypothesis.source,
+            T_map_cam_coarse=self._T_map_scene.camera(hypothesis.T_scene_cam),
+        )
+
+    def _render_scene(self, camera: Camera, T_scene_cam: Array) -> tuple[Image, Image, Image]:
+        return render_scene(self._package, camera, T_scene_cam, self._config.runtime.threads)
+
+
+def render_scene(
+    package: MapPackage, camera: Camera, T_scene_cam: Array, threads: int
+) -> tuple[Image, Image, Image]:
+    """RGB, depth and alpha of a compiled map over its own background, scene units."""
+    red, green, blue = package.manifest.background
+    return package.gaussians.render(
+        camera, np.linalg.inv(T_scene_cam), (red, green, blue), threads
+    )
+
+
+def _matcher_of(package: MapPackage, config: Config) -> Matcher:
+    matcher = make_matcher(config.features)
+    made_with = package.manifest.matcher
+    if matcher.name != made_with:
+        raise MapError(
+            f"the map '{package.manifest.name}' was compiled with {made_with} features, but "
+            f"{matcher.name} is configured or the only one installed; compile it again"
+        )
+    return matcher
+
+
+def _covariance_in_map(refinement: Refinement, T_map_scene: Sim3) -> Array | None:
+    """The scene's covariance in the map's axes and metres."""
+    if refinement.covariance_scene is None:
+        return None
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = T_map_scene.scale * T_map_scene.rotation
+    turn[3:, 3:] = T_map_scene.rotation
+    return np.asarray(turn @ refinement.covariance_scene @ turn.T)
+
+
+def _contrast(image: NDArray[np.uint8]) -> float:
+    """Standard deviation of the grey levels, seen at low resolution so that noise is no contrast."""
+    small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (64, 48), interpolation=cv2.INTER_AREA)
+    return float(np.std(small))
+
+
+def _timed(result: LocalizationResult, timer: StageTimer) -> LocalizationResult:
+    # frozen like the rest, yet complete only now
+    object.__setattr__(result, "timings_ms", timer.timings_ms())
+    return result

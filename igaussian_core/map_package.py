@@ -1,0 +1,229 @@
+"""The compiled map: a directory with a manifest, the Gaussians and their landmarks.
+
+    room.igmap/
+      manifest.json           version, frames, bounds, hashes; written last
+      gaussians.ply           the Gaussians, INRIA layout
+      landmarks.safetensors   source views and the 3D points seen in them
+
+Only data formats are read: opening a map never runs code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import os
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import load_file, save_file
+
+from igaussian_core.errors import MapError
+from igaussian_core.gaussian_map import GaussianMap, file_sha256, load_map, save_ply
+from igaussian_core.geometry import Sim3
+
+log = logging.getLogger(__name__)
+
+FORMAT = "igaussian-map"
+VERSION = 1
+
+_MANIFEST = "manifest.json"
+_GAUSSIANS = "gaussians.ply"
+_LANDMARKS = "landmarks.safetensors"
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a compiled map says of itself.
+
+    Attributes:
+        name: the source file's name without its suffix.
+        kind: "object" (views look inward) or "scene" (outward).
+        radius: of the spherical views in scene units.
+        bounds: corners [2][3] of the box that the map's bulk fills, scene units.
+        T_map_scene: 4x4 similarity from the Gaussian file's frame into `map`, metres.
+        matcher: the features that the landmarks were made with.
+        background: RGB in [0, 1] that lies behind the Gaussians.
+        source_file, source_sha256: the file that was compiled.
+        gaussians_sha256: of the copy inside the package.
+    """
+
+    name: str
+    kind: str
+    radius: float
+    bounds: list[list[float]]
+    T_map_scene: list[list[float]]
+    matcher: str
+    background: list[float]
+    source_file: str
+    source_sha256: str
+    gaussians_sha256: str
+    format: str = FORMAT
+    version: int = VERSION
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """3D points seen in V source views, grouped by view, best score first in each.
+
+    Attributes:
+        points: [M, 3] float32 in scene units.
+        descriptors: [M, D] float32, L2-normalised (float16 on disk).
+        offsets: [V + 1] int64; view v owns the points offsets[v]:offsets[v + 1].
+        T_scene_cam: [V, 4, 4] float64 poses of the source views.
+        intrinsics: [V, 6] float64: width, height, fx, fy, cx, cy.
+    """
+
+    points: NDArray[np.float32]
+    descriptors: NDArray[np.float32]
+    offsets: NDArray[np.int64]
+    T_scene_cam: NDArray[np.float64]
+    intrinsics: NDArray[np.float64]
+
+    @property
+    def view_count(self) -> int:
+        return len(self.T_scene_cam)
+
+
+@dataclass(frozen=True)
+class MapPackage:
+    """A compiled map in memory."""
+
+    manifest: Manifest
+    gaussians: GaussianMap
+    landmarks: Landmarks
+
+    @property
+    def T_map_scene(self) -> Sim3:
+        return Sim3.from_matrix(self.manifest.T_map_scene)
+
+
+def save_package(package: MapPackage, path: str | os.PathLike[str]) -> None:
+    """Write the directory as a whole: an older one at `path` is replaced only at the end.
+
+    Raises:
+        MapError: `path` exists and is no compiled map, or cannot be written.
+    """
+    target = Path(path)
+    if target.exists() and not (target / _MANIFEST).is_file():
+        raise MapError(f"{target}: exists and is no compiled map; it is left alone")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    except OSError as error:
+        raise MapError(f"{target}: cannot be written: {error}") from error
+    try:
+        _write(package, staging)
+        staging.chmod(0o755)
+        if target.exists():
+            shutil.rmtree(target)
+        staging.rename(target)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def open_package(path: str | os.PathLike[str]) -> MapPackage:
+    """Read a compiled map and check that its parts belong together.
+
+    Raises:
+        MapError: missing, of a newer version, altered, incomplete.
+    """
+    folder = Path(path)
+    manifest = _read_manifest(folder)
+    ply = folder / _GAUSSIANS
+    if not ply.is_file() or file_sha256(ply) != manifest.gaussians_sha256:
+        state = "was changed" if ply.is_file() else "is missing"
+        raise MapError(f"{ply}: {state} since the map was compiled; compile it again")
+    source = folder.parent / manifest.source_file
+    if source.is_file() and file_sha256(source) != manifest.source_sha256:
+        log.warning("%s: %s was changed since; compile it again to use the new one",
+                    folder, source)  # fmt: skip
+    return MapPackage(manifest, load_map(ply), _read_landmarks(folder / _LANDMARKS))
+
+
+def with_T_map_scene(path: str | os.PathLike[str], T_map_scene: Sim3) -> Manifest:
+    """Give a compiled map another `T_map_scene`; returns the new manifest.
+
+    Raises:
+        MapError: no compiled map.
+    """
+    folder = Path(path)
+    manifest = dataclasses.replace(
+        _read_manifest(folder), T_map_scene=T_map_scene.matrix().tolist()
+    )
+    _write_manifest(manifest, folder)
+    return manifest
+
+
+def _write(package: MapPackage, folder: Path) -> None:
+    landmarks = package.landmarks
+    save_ply(package.gaussians, folder / _GAUSSIANS)
+    save_file(
+        {
+            "points": np.ascontiguousarray(landmarks.points),
+            "descriptors": np.ascontiguousarray(landmarks.descriptors.astype(np.float16)),
+            "offsets": np.ascontiguousarray(landmarks.offsets),
+            "T_scene_cam": np.ascontiguousarray(landmarks.T_scene_cam),
+            "intrinsics": np.ascontiguousarray(landmarks.intrinsics),
+        },
+        str(folder / _LANDMARKS),
+    )
+    manifest = dataclasses.replace(
+        package.manifest, gaussians_sha256=file_sha256(folder / _GAUSSIANS)
+    )
+    _write_manifest(manifest, folder)
+
+
+def _write_manifest(manifest: Manifest, folder: Path) -> None:
+    temporary = folder / (_MANIFEST + ".new")
+    temporary.write_text(json.dumps(dataclasses.asdict(manifest), indent=1) + "\n")
+    temporary.replace(folder / _MANIFEST)
+
+
+def _read_manifest(folder: Path) -> Manifest:
+    file = folder / _MANIFEST
+    if not file.is_file():
+        hint = "a .ply is compiled first with 'igaussian map compile'"
+        what = "no such directory" if not folder.exists() else f"no compiled map (no {_MANIFEST})"
+        raise MapError(f"{folder}: {what}; {hint}")
+    try:
+        data: dict[str, Any] = json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise MapError(f"{file}: unreadable: {error}") from error
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise MapError(f"{file}: not the manifest of a compiled map")
+    if data.get("version") != VERSION:
+        raise MapError(
+            f"{file}: version {data.get('version')}, this release reads version {VERSION}; "
+            "update iGaussian or compile the map again"
+        )
+    try:
+        manifest = Manifest(**data)
+        Sim3.from_matrix(manifest.T_map_scene)
+    except (TypeError, ValueError) as error:
+        raise MapError(f"{file}: damaged manifest: {error}") from error
+    return manifest
+
+
+def _read_landmarks(file: Path) -> Landmarks:
+    try:
+        data = load_file(str(file))
+        landmarks = Landmarks(
+            data["points"],
+            data["descriptors"].astype(np.float32),
+            data["offsets"],
+            data["T_scene_cam"],
+            data["intrinsics"],
+        )
+    except Exception as error:  # safetensors raises its own unrelated types
+        raise MapError(f"{file}: unreadable landmarks: {error}") from error
+    counts = (len(landmarks.points), len(landmarks.descriptors), int(landmarks.offsets[-1]))
+    if len(set(counts)) != 1 or len(landmarks.offsets) != landmarks.view_count + 1:
+        raise MapError(f"{file}: damaged landmarks: sizes {counts} do not belong together")
+    return landmarks

@@ -1,0 +1,1 @@
+"""Stage two: where exactly is the camera, and can that be believed?"""
