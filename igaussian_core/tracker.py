@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from igaussian_core.camera import Camera
 from igaussian_core.config import Config
+from igaussian_core.frame import Frame
 from igaussian_core.geometry import compose, inverse, rotation_from_vector, vector_from_rotation
 from igaussian_core.localizer import Localizer
 from igaussian_core.result import LocalizationResult
@@ -20,20 +20,6 @@ Array = NDArray[np.float64]
 
 _ODOMETRY_LENGTH = 2000
 _MAX_ODOMETRY_GAP_S = 0.25
-
-
-@dataclass(frozen=True)
-class Frame:
-    """An image with its stamp and camera.
-
-    Attributes:
-        stamp_ns: nanoseconds, of whatever clock the source uses throughout.
-        image: uint8 RGB [H, W, 3].
-    """
-
-    stamp_ns: int
-    image: NDArray[np.uint8]
-    camera: Camera
 
 
 @dataclass(frozen=True)
