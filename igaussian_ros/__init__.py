@@ -21,3 +21,6 @@ def _warn_of_foreign_rmw() -> None:
 
 
 _warn_of_foreign_rmw()
+# torch's threads else spin while they wait for one another: on a robot whose cores are busy with
+# other processes that makes a frame several times slower. Read when torch is loaded.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")

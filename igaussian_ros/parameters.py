@@ -7,6 +7,8 @@ those that only ROS has are in `ROS_OPTIONS`.
 from __future__ import annotations
 
 import difflib
+import json
+import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -170,6 +172,44 @@ def unknown_parameters(node: Node) -> list[str]:
     return lines
 
 
+def to_yaml() -> str:
+    """The parameter file with every default, `msg_configs/localizer.yaml`."""
+    lines = [
+        "# Parameters of the node `localizer` with their defaults. Written by",
+        "#   python -m igaussian_ros.parameters > msg_configs/localizer.yaml",
+        "# Used by",
+        "#   ros2 run igaussian_ros localizer --ros-args --params-file msg_configs/localizer.yaml \\",
+        "#     -p map_path:=room.igmap",
+        "/**:",
+        "  ros__parameters:",
+    ]
+    group = ""
+    for name, option in all_options().items():
+        prefix, _, key = name.rpartition(".")
+        indent = "      " if prefix else "    "
+        if prefix and prefix != group:
+            lines.append(f"    {prefix}:")
+            group = prefix
+        lines += [f"{indent}# {line}" for line in _comment(option, 100 - len(indent) - 2)]
+        lines.append(f"{indent}{key}: {_yaml_value(option.default)}")
+    return "\n".join(lines) + "\n"
+
+
+def _comment(option: Option, width: int) -> list[str]:
+    text = option.help
+    if option.choices:
+        text += f" [{' | '.join(option.choices)}]"
+    elif option.low is not None:
+        text += f" [{option.low:g} to {_bounds(option)[1]:g}]"
+    return textwrap.wrap(text, width)
+
+
+def _yaml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return json.dumps(value) if isinstance(value, (str, list)) else repr(value)
+
+
 def _given(node: Node, name: str) -> Any:
     """The value given at start in whatever type, None where there is none.
 
@@ -229,3 +269,7 @@ def _on_set(parameters: list[Parameter]) -> SetParametersResult:
 
 def _is_array(value: Any) -> bool:
     return not isinstance(value, (str, bytes)) and hasattr(value, "__iter__")
+
+
+if __name__ == "__main__":
+    print(to_yaml(), end="")

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CompressedImage, Image
 
 from igaussian_core.errors import IGaussianError
+from igaussian_core.frame import Frame
 from igaussian_core.result import LocalizationResult
-from igaussian_core.tracker import Frame, Tracker
+from igaussian_core.tracker import Tracker
 from igaussian_ros.camera_cache import CameraCache
 from igaussian_ros.convert import image_from_ros, stamp_to_ns
 from igaussian_ros.parameters import Settings

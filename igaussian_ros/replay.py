@@ -6,8 +6,8 @@ Recorded CDR bytes are published as they are, with the recording's QoS, next to 
 from __future__ import annotations
 
 import argparse
-import array
 import importlib
+import itertools
 import re
 import signal
 import struct
@@ -18,8 +18,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
-import numpy as np
 import rclpy
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -108,10 +106,10 @@ class Replayer:
             BagError: damaged data on the way.
         """
         self._wait_for_subscribers()
-        loop = 0
-        while not self._over.is_set() and self._options.loops in (0, *range(loop + 1, 10**6)):
+        for loop in itertools.count(1):
             self._run_once()
-            loop += 1
+            if self._over.is_set() or loop == self._options.loops:
+                break
         for channel in self._channels.values():
             # a reliable reader may still miss what was published last
             if channel.publisher.qos_profile.reliability == ReliabilityPolicy.RELIABLE:
@@ -177,7 +175,7 @@ class Replayer:
         begin_ns, begin = first.log_time_ns, time.monotonic()
         wall_ns = time.time_ns()
         next_tick = begin
-        for message in _chain(first, messages):
+        for message in itertools.chain([first], messages):
             due = begin + (message.log_time_ns - begin_ns) * 1e-9 / self._options.rate
             while (now := time.monotonic()) < due and not self._over.is_set():
                 next_tick = self._tick(now, next_tick, begin, begin_ns)
@@ -201,6 +199,11 @@ class Replayer:
     def _messages(self) -> Iterator[RawMessage]:
         options, first_ns = self._options, None
         for message in self._bag.messages(list(self._channels)):
+            if message.encoding != "cdr":
+                raise BagError(
+                    f"{self._bag.path}: {message.topic} is encoded as '{message.encoding}'; "
+                    "only CDR, ROS 2's encoding, can be replayed"
+                )
             first_ns = message.log_time_ns if first_ns is None else first_ns
             elapsed_s = (message.log_time_ns - first_ns) * 1e-9
             if options.duration_s is not None and elapsed_s > options.start_s + options.duration_s:
@@ -227,10 +230,7 @@ def decoded(data: bytes, topic: str, node: Node) -> Image | None:
     except IGaussianError as error:
         node.get_logger().warning(str(error))
         return None
-    if not compressed.format.startswith("rgb8"):
-        return image_to_ros(rgb, compressed.header)
-    image = image_to_ros(rgb, compressed.header)
-    return image
+    return image_to_ros(rgb, compressed.header)
 
 
 def restamped(data: bytes, begin_ns: int, wall_ns: int, rate: float) -> bytes:
@@ -266,8 +266,9 @@ def qos_of(topic: Topic) -> QoSProfile:
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         return QoSProfile(depth=10, durability=durability)
     offered = topic.qos[0]
+    keep_all = offered.history == "keep_all"
     return QoSProfile(
-        history=HistoryPolicy.KEEP_ALL if offered.history == "keep_all" else HistoryPolicy.KEEP_LAST,
+        history=HistoryPolicy.KEEP_ALL if keep_all else HistoryPolicy.KEEP_LAST,
         depth=max(1, offered.depth),
         reliability=ReliabilityPolicy.BEST_EFFORT
         if offered.reliability == "best_effort"
@@ -278,17 +279,12 @@ def qos_of(topic: Topic) -> QoSProfile:
     )
 
 
-def _chain(first: RawMessage, rest: Iterator[RawMessage]) -> Iterator[RawMessage]:
-    yield first
-    yield from rest
-
-
 def parse(arguments: list[str] | None = None) -> tuple[str, Options]:
     """Path of the bag and the options; exits with a usage line on a wrong one."""
     parser = argparse.ArgumentParser(prog="replay", description="Replay a recording over ROS 2.")
     parser.add_argument("bag", help="an .mcap file or a rosbag2 directory")
     parser.add_argument("--rate", type=_positive, default=1.0, help="2.0 is twice as fast")
-    parser.add_argument("--loop", type=int, default=1, metavar="N", help="times; 0: for ever")
+    parser.add_argument("--loop", type=_count, default=1, metavar="N", help="times; 0: for ever")
     parser.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds to skip")
     parser.add_argument("--duration", type=_positive, metavar="S", help="seconds to play")
     parser.add_argument("--topics", nargs="+", default=[], help="these topics only")
@@ -325,6 +321,13 @@ def _positive(text: str) -> float:
     value = float(text)
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not positive")
+    return value
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is negative")
     return value
 
 
