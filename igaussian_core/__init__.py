@@ -1,5 +1,12 @@
 """iGaussian: where is the camera in a 3D Gaussian Splatting map? ROS-free core."""
 
+import os
+
+# Threads that spin at OpenMP's barriers slow a frame tenfold as soon as another process wants
+# a core, as on any robot; it is read when torch loads, so it is set before that.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+# ruff: noqa: E402
 from igaussian_core.camera import Camera
 from igaussian_core.config import Config
 from igaussian_core.errors import IGaussianError
