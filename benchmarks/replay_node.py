@@ -9,6 +9,7 @@ arrival of its pose at a third process, transport included. Prints one JSON obje
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import signal
@@ -77,10 +78,8 @@ def main() -> int:
 
 
 def _spin(executor: SingleThreadedExecutor) -> None:
-    try:
+    with contextlib.suppress(ExternalShutdownException):
         executor.spin()
-    except ExternalShutdownException:
-        pass
 
 
 def _node_command(options: argparse.Namespace) -> list[str]:

@@ -178,8 +178,8 @@ def to_yaml() -> str:
         "# Parameters of the node `localizer` with their defaults. Written by",
         "#   python -m igaussian_ros.parameters > msg_configs/localizer.yaml",
         "# Used by",
-        "#   ros2 run igaussian_ros localizer --ros-args --params-file msg_configs/localizer.yaml \\",
-        "#     -p map_path:=room.igmap",
+        "#   ros2 run igaussian_ros localizer --ros-args -p map_path:=room.igmap \\",
+        "#     --params-file msg_configs/localizer.yaml",
         "/**:",
         "  ros__parameters:",
     ]

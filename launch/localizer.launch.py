@@ -12,10 +12,11 @@ import os
 from pathlib import Path
 from typing import Any
 
-from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+
+from launch import LaunchContext, LaunchDescription
 
 # beside launch/ in a checkout and in share/igaussian_ros alike
 CONFIGS = Path(__file__).resolve().parents[1] / "msg_configs"
