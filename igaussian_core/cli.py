@@ -336,6 +336,89 @@ def _print_result(result: Any) -> None:
     console.print({stage: round(ms, 1) for stage, ms in result.timings_ms.items()})
 
 
+@app.command()
+def demo(
+    bag: Annotated[
+        Optional[Path], typer.Option(help="recording with true poses; default: the bundled drive")
+    ] = None,
+    map_path: Annotated[
+        Optional[Path], typer.Option("--map", help=".igmap or .ply; default: the bundled room")
+    ] = None,
+    cameras: Annotated[
+        Optional[Path], typer.Option(help="training cameras of the .ply, as for map compile")
+    ] = None,
+    work_dir: Annotated[
+        Path, typer.Option(help="compiled map, report and recording go here")
+    ] = Path("out"),
+    rate: Annotated[float, typer.Option(help="replay rate; latencies hold at 1", min=0.01)] = 1.0,
+    duration: Annotated[
+        Optional[float], typer.Option(help="seconds of the recording", min=0.1)
+    ] = None,
+    truth: Annotated[Optional[str], typer.Option(help="topic of the true camera poses")] = None,
+    no_ros: Annotated[
+        bool, typer.Option("--no-ros", help="same worker and tracker inside this process")
+    ] = False,
+    json_out: Annotated[Optional[Path], typer.Option("--json", help="write figures here")] = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+) -> None:
+    """Localize a recorded drive through the real ROS 2 node; a live table, then a report."""
+    try:
+        from igaussian_ros.demo import DemoOptions, run_demo
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"the demo needs the package igaussian_ros: {error}") from error
+
+    options = DemoOptions(
+        bag=bag, map=map_path, cameras=cameras, work_dir=work_dir, rate=rate, duration_s=duration,
+        without_ros=no_ros, truth_topic=truth, config=load_config(config, set_),
+    )  # fmt: skip
+    run_demo(options, json_out, console)
+
+
+@app.command("replay")
+def replay_bag(
+    bag: Annotated[Path, typer.Argument(help=".mcap, rosbag2 directory or ROS 1 .bag")],
+    map_path: MapOption,
+    rate: Annotated[float, typer.Option(help="2 plays twice as fast", min=0.01)] = 1.0,
+    duration: Annotated[
+        Optional[float], typer.Option(help="seconds of the recording", min=0.1)
+    ] = None,
+    every_frame: Annotated[
+        bool, typer.Option(help="process every frame, however long it takes")
+    ] = False,
+    recover: Annotated[
+        bool, typer.Option(help="use what is readable of a truncated recording")
+    ] = False,
+    image_topic: Annotated[Optional[str], typer.Option(help="default: found")] = None,
+    camera_info_topic: Annotated[Optional[str], typer.Option(help="default: found")] = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+) -> None:
+    """Localize a recording without ROS; one JSON line for each processed frame on stdout."""
+    from igaussian_core.bags import Bag
+    from igaussian_core.localizer import Localizer
+    from igaussian_core.replay import ReplayedFrame, replay
+
+    def show(frame: ReplayedFrame) -> None:
+        line = {
+            "stamp_ns": frame.frame.stamp_ns,
+            "latency_ms": frame.latency_ms,
+            **result_json(frame.result),
+        }
+        print(json.dumps(line), flush=True)
+
+    configuration = load_config(config, set_)
+    localizer = Localizer.open(map_path, configuration)
+    with Bag(bag, recover) as recording:
+        for problem in recording.problems:
+            print(f"warning: {problem}", file=sys.stderr)
+        stats = replay(
+            recording, localizer, configuration, show, rate, duration, every_frame,
+            topics=(image_topic, camera_info_topic),
+        )  # fmt: skip
+    print(f"{stats.processed} frames processed, {stats.dropped} dropped", file=sys.stderr)
+
+
 @eval_app.command("photos")
 def eval_photos(
     poses: Annotated[Path, typer.Argument(help="photos with poses, as for map compile --cameras")],

@@ -1,4 +1,4 @@
-"""Where the bundled files lie: in a checkout, or under the prefix that pip or colcon installed to."""
+"""Where the bundled files lie: in a checkout, or under the prefix of an installation."""
 
 from __future__ import annotations
 

@@ -117,8 +117,7 @@ def run_demo(
     bag_path = options.bag or _bundled("bags/demo/drive")
     with Bag(bag_path) as bag:
         truth = Trajectory(bag.poses(options.truth_topic))
-        image_topic = bag.image_topic()
-        sent = bag.topics[image_topic].count
+        sent = _images_in(bag, options.duration_s)
     map_path = prepare_map(options, console)
     table = DriveTable(console)
     console.print(f"recording {bag_path}: {sent} images, {len(truth)} true poses")
@@ -133,6 +132,17 @@ def run_demo(
         json_path.write_text(json.dumps(plain(figures), indent=1) + "\n")
     _print_outcome(console, outcome, ride)
     return outcome
+
+
+def _images_in(bag: Bag, duration_s: float | None) -> int:
+    """Images in the part of the recording that is played, which begins with its first message."""
+    topic, begin_ns, count = bag.image_topic(), None, 0
+    for message in bag.messages():
+        begin_ns = message.log_time_ns if begin_ns is None else begin_ns
+        if duration_s is not None and (message.log_time_ns - begin_ns) * 1e-9 > duration_s:
+            break
+        count += message.topic == topic
+    return count
 
 
 # --- the map ---

@@ -33,6 +33,7 @@ if TYPE_CHECKING:  # the middleware reads its environment when it is imported
 Array = NDArray[np.float64]
 
 _START_S, _STOP_S = 90.0, 10.0
+_SAMPLE_S = 0.5
 _QUIET_S = 1.5  # after the replay: so long without news is the end
 _STATUSES = {status.value for status in Status}
 
@@ -146,6 +147,8 @@ def ride_with_ros(
         status = node.stop()
     if status != 0:
         console.print(f"[red]the node ended with status {status}, see {node.log}[/]")
+    begin_s = watch.frames[0].arrived_s if watch.frames else 0.0
+    memory = [MemorySample(m.time_s - begin_s, m.rss_mb) for m in memory if m.time_s >= begin_s]
     return Ride(watch.frames, memory, "over DDS: node and replay as processes of their own")
 
 
@@ -267,14 +270,14 @@ def _wait_until_ready(listener: Listener, node: Child) -> None:
 
 
 def _follow(watch: _Watch, node: Child, player: Child) -> list[MemorySample]:
-    """Until the replay is over and the node quiet; the node's memory once a second."""
-    begin = last_news = time.monotonic()
-    next_sample, memory = begin, []
+    """Until the replay is over and the node quiet; the node's memory by wall time."""
+    last_news = next_sample = time.monotonic()
+    memory = []
     while True:
         now = time.monotonic()
         if now >= next_sample:
-            memory.append(MemorySample(now - begin, resident_mb(node.pid)))
-            next_sample += 1.0
+            memory.append(MemorySample(time.time(), resident_mb(node.pid)))
+            next_sample += _SAMPLE_S
         if watch.take() > 0 or player.running:
             last_news = now
         if now - last_news > _QUIET_S:

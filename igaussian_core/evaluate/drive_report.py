@@ -152,7 +152,7 @@ def _trajectory_figure(drive: Drive) -> Figure:
     true = path @ plan.T
     if len(drive.truth):
         axis.plot(*true.T, color=_TRUTH, linewidth=5, alpha=0.7, label="truth", zorder=3)
-    _draw_estimates(axis, drive.frames, plan)
+    _draw_estimates(axis, drive.frames, plan, 0.05 * float(np.ptp(true, axis=0).max()))
     axis.plot(*true[0], "o", color="black", markersize=7, zorder=6, label="start")
     axis.set(xlabel=names[0], ylabel=names[1], aspect="equal")
     axis.grid(visible=False)
@@ -188,13 +188,14 @@ def _draw_map(
     )  # fmt: skip
 
 
-def _draw_estimates(axis: Any, frames: Sequence[DriveFrame], plan: Array) -> None:
+def _draw_estimates(
+    axis: Any, frames: Sequence[DriveFrame], plan: Array, tick_length: float
+) -> None:
     accepted = [f.T_map_cam for f in frames if f.T_map_cam is not None]
     if accepted:
         at = np.array([T[:3, 3] for T in accepted]) @ plan.T
         looking = np.array([T[:3, 2] for T in accepted]) @ plan.T
-        size = max(0.04 * float(np.ptp(at, axis=0).max()), 1e-3)
-        ticks = [[a, a + size * v] for a, v in zip(at, looking, strict=True)]
+        ticks = [[a, a + tick_length * v] for a, v in zip(at, looking, strict=True)]
         axis.add_collection(LineCollection(ticks, colors=_ESTIMATE, linewidths=0.9, zorder=4))
         axis.plot(
             *at.T, ".", color=_ESTIMATE, markersize=6, zorder=5,
@@ -230,7 +231,8 @@ def _error_figure(drive: Drive) -> Figure:
         for frame in drive.frames:
             if frame.T_map_cam is None:
                 axis.axvline(frame.time_s, color=_LOST, linewidth=1, alpha=0.5)
-    axes[-1].set_xlabel("time in the recording [s]; red lines: lost")
+    lost = any(frame.T_map_cam is None for frame in drive.frames)
+    axes[-1].set_xlabel("time in the recording [s]" + ("; red lines: lost" if lost else ""))
     return figure
 
 
@@ -250,12 +252,14 @@ def _latency_figure(drive: Drive) -> Figure:
     )  # fmt: skip
     axes[0].set(ylabel="latency [ms]", ylim=(0, None))
     if accepted:
-        axes[0].legend(fontsize=8, ncols=3, loc="upper right", framealpha=0.9)
-        axes[0].margins(y=0.25)
+        figure.legend(loc="outside upper center", fontsize=8, ncols=8, frameon=False)
     axes[1].plot(
         [m.time_s for m in drive.memory], [m.rss_mb for m in drive.memory], color=_ESTIMATE
     )
-    axes[1].set(ylabel="memory [MB]", ylim=(0, None), xlabel="time since the drive began [s]")
+    highest = max((m.rss_mb for m in drive.memory), default=1.0)
+    axes[1].set(
+        ylabel="memory [MB]", ylim=(0, 1.15 * highest), xlabel="time since the drive began [s]"
+    )
     return figure
 
 
@@ -266,11 +270,11 @@ body{font:16px/1.5 system-ui,sans-serif;color:#1c2530;margin:0;background:#f4f6f
 main{max-width:1080px;margin:0 auto;padding:24px}
 h1{font-size:26px;margin:0 0 4px}h2{font-size:19px;margin:32px 0 8px}
 p.lead{margin:0 0 20px;color:#55606c}
-.cards{display:grid;grid-template-columns:repeat(auto-fit,minmax(150px,1fr));gap:12px}
+.cards{display:grid;grid-template-columns:repeat(auto-fit,minmax(220px,1fr));gap:12px}
 .card{background:#fff;border:1px solid #e0e5ea;border-radius:8px;padding:12px 14px}
 .card b{display:block;font-size:24px;line-height:1.25;font-variant-numeric:tabular-nums}
 .card span{font-size:13px;color:#55606c}.card.bad{border-color:#c8322b;background:#fdf1f0}
-img{max-width:100%;height:auto;display:block;background:#fff;border-radius:8px}
+img{max-width:100%;height:auto;display:block;margin:0 auto;background:#fff;border-radius:8px}
 figure{margin:0 0 20px;background:#fff;border:1px solid #e0e5ea;border-radius:8px;padding:10px}
 figcaption{font-size:13px;color:#55606c;margin-top:6px;font-variant-numeric:tabular-nums}
 .pair{display:grid;grid-template-columns:1fr 1fr 1fr;gap:6px}
@@ -301,7 +305,7 @@ def _page(drive: Drive, pictures: Mapping[str, bytes]) -> str:
         f"<title>{html.escape(drive.title)}</title><style>{_STYLE}</style><main>",
         f"<h1>{html.escape(drive.title)}</h1>",
         f"<p class=lead>{int(drive.figures['accepted'])} of {int(drive.figures['processed'])} "
-        f"processed frames localized, {int(drive.figures['sent'])} images in the recording.</p>",
+        f"processed frames localized, {int(drive.figures['sent'])} images played.</p>",
         _cards(drive.figures, failed),
         "<h2>Trajectory</h2>",
         _picture(pictures["trajectory"], "Grey: the map's Gaussians around camera height."),
