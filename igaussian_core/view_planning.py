@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from igaussian_core.camera import Camera
 from igaussian_core.gaussian_map import GaussianMap
+from igaussian_core.geometry import inverse
+from igaussian_core.lifting import trusted_depth
 from igaussian_core.posed_images import PosedImage
 from igaussian_core.views import (
     fibonacci_directions,
@@ -65,11 +67,12 @@ def plan_views(
     low, high = gmap.bounds()
     poses = np.array([image.T_scene_cam for image in posed]).reshape(-1, 4, 4)
     kind = kind or (_kind_of(poses, low, high) if len(poses) else "scene")
-    axis = np.array(up, float) if up else _up_of(poses, low, high)
+    axis = np.array(up, float) / np.linalg.norm(up) if up else _up_of(poses)
+    upright = np.array([0.0, 0.0, 1.0]) if axis is None else axis
     if len(poses):
-        return _plan_from_cameras(posed, poses, low, high, kind, radius, axis, count, max_side)
+        return _plan_from_cameras(posed, poses, low, high, kind, radius, upright, count, max_side)
     if kind == "object":
-        return _plan_object(low, high, radius, axis, count)
+        return _plan_object(low, high, radius, upright, count)
     return _plan_scene(gmap, low, high, radius, axis, count, threads, progress)
 
 
@@ -109,10 +112,102 @@ def _plan_object(
 
 
 def _plan_scene(
-    gmap: GaussianMap, low: Array, high: Array, radius: float | None, up: Array, count: int,
+    gmap: GaussianMap, low: Array, high: Array, radius: float | None, up: Array | None, count: int,
     threads: int, progress: Progress,
 ) -> ViewPlan:  # fmt: skip
-    raise NotImplementedError
+    """The paper's sphere where the training cameras probably were, and views all around there."""
+    positions = likely_camera_positions(gmap, low, high)
+    centre = np.median(positions, axis=0)
+    if up is None:
+        up = _up_of_scene(0.5 * (low + high) - centre, high - low)
+    radius = radius or 0.02 * float(np.linalg.norm(high - low))
+    candidates = _look_around(positions, low, high, up)
+    good = _clear_views(gmap, candidates, threads, progress)
+    chosen = spread_indices(good, count, length=float(np.linalg.norm(high - low)) / 4)
+    poses = [*spherical_views("scene", radius, centre, up), *good[chosen]]
+    return ViewPlan("scene", radius, [SourceView(_DEFAULT_CAMERA, T) for T in poses])
+
+
+def likely_camera_positions(
+    gmap: GaussianMap, low: Array, high: Array, samples: int = 4000, share: float = 0.03
+) -> Array:
+    """Where a map's training cameras probably were, [N, 3], read off the Gaussians' sizes.
+
+    Training splits Gaussians until they are small in the image, so their size grows with the
+    distance from the cameras: places from which log size and log distance correlate best are
+    likely. Among random ones, true camera positions rank in the best few per cent
+    (benchmarks/camera_traces.py).
+    """
+    rng = np.random.default_rng(0)
+    positions = low - 0.75 * (high - low) + rng.random((samples, 3)) * 2.5 * (high - low)
+    correlation = size_distance_correlation(gmap, positions, low, high)
+    return np.asarray(positions[np.argsort(-correlation)[: max(1, int(share * samples))]])
+
+
+def size_distance_correlation(
+    gmap: GaussianMap, positions: Array, low: Array, high: Array
+) -> Array:
+    """Correlation [N] of log size and log distance of the Gaussians from positions [N, 3]."""
+    inside = ((gmap.means > low) & (gmap.means < high)).all(axis=1) & (gmap.opacities > 0.3)
+    index = np.random.default_rng(0).permutation(np.flatnonzero(inside))[:4000]
+    if len(index) < 50:
+        return np.zeros(len(positions))
+    points = gmap.means[index].astype(np.float64)
+    two_largest = np.sort(gmap.scales[index].astype(np.float64), axis=1)[:, 1:]
+    log_size = _standardized(np.log(np.maximum(two_largest, 1e-9)).mean(axis=1))
+    return np.array(
+        [
+            log_size @ _standardized(np.log(np.linalg.norm(points - position, axis=1) + 1e-9))
+            for position in positions
+        ]
+    )
+
+
+def _standardized(values: Array) -> Array:
+    centred = values - values.mean()
+    return np.asarray(centred / max(float(np.linalg.norm(centred)), 1e-12))
+
+
+def _look_around(positions: Array, low: Array, high: Array, up: Array, each: int = 8) -> Array:
+    """Poses [N, 4, 4] from positions towards the map's bulk, kept near the horizontal."""
+    rng = np.random.default_rng(1)
+    poses = []
+    for position in positions:
+        for target in low + rng.random((each, 3)) * (high - low):
+            forward = target - position
+            rise = forward @ up
+            level = forward - rise * up
+            length = max(float(np.linalg.norm(level)), 1e-9)
+            direction = level / length + np.clip(rise / length, -0.6, 0.6) * up
+            poses.append(look_at(position, position + direction, up))
+    return np.array(poses)
+
+
+def _clear_views(
+    gmap: GaussianMap, poses: Array, threads: int, progress: Progress, keep: float = 0.5
+) -> Array:
+    """The poses whose small render is opaque, free of depth edges and of things right ahead."""
+    small = _DEFAULT_CAMERA.resized(160, 120)
+    low, high = gmap.bounds()
+    clearance = 0.06 * float(np.linalg.norm(high - low))
+    scores = np.zeros(len(poses))
+    for i, T_scene_cam in enumerate(poses):
+        _, depth, alpha = gmap.render(small, inverse(T_scene_cam), threads=threads)
+        near = np.percentile(depth[alpha > 0.5], 5) if (alpha > 0.5).any() else 0.0
+        if near > clearance:
+            scores[i] = trusted_depth(depth, alpha, 0.8, 0.1).mean()
+        progress("views tried", i + 1, len(poses))
+    best = np.argsort(-scores, kind="stable")[: max(1, int(keep * len(poses)))]
+    return poses[best[scores[best] > 0.1]] if (scores > 0.1).any() else poses[best[:1]]
+
+
+def _up_of_scene(towards: Array, extent: Array) -> Array:
+    """z or -y, the usual conventions; never along the view, -y only for maps flat that way."""
+    towards = np.abs(towards) / np.linalg.norm(towards)
+    flat = extent[1] < 0.6 * extent[2]
+    if towards[2] > 0.8 or (flat and towards[1] < 0.8):
+        return np.array([0.0, -1.0, 0.0])
+    return np.array([0.0, 0.0, 1.0])
 
 
 def _kind_of(poses: Array, low: Array, high: Array) -> str:
@@ -127,14 +222,10 @@ def _kind_of(poses: Array, low: Array, high: Array) -> str:
     return "object" if outside > 0.8 and looking > 0.8 and surround else "scene"
 
 
-def _up_of(poses: Array, low: Array, high: Array) -> Array:
-    """Against the cameras' mean y axis; without cameras z or -y, the usual conventions.
-
-    Rooms and objects on a table are wider than high, so the shorter of the two is up.
-    """
-    if len(poses):
-        up = -poses[:, :3, 1].mean(axis=0)
-        if np.linalg.norm(up) > 0.2:
-            return np.asarray(up / np.linalg.norm(up))
-    extent = high - low
-    return np.array([0.0, -1.0, 0.0]) if extent[1] < 0.9 * extent[2] else np.array([0.0, 0.0, 1.0])
+def _up_of(poses: Array) -> Array | None:
+    """Against the cameras' mean y axis; None without cameras or where they disagree."""
+    if len(poses) == 0:
+        return None
+    up = -poses[:, :3, 1].mean(axis=0)
+    length = float(np.linalg.norm(up))
+    return np.asarray(up / length) if length > 0.2 else None
