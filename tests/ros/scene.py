@@ -133,8 +133,11 @@ def _draw(
 def drive(count: int) -> list[np.ndarray]:
     """Camera poses T_map_cam of a slow arc that looks into the corner."""
     angles = np.linspace(0.0, 0.9, count)
-    positions = [[-1.2 + 1.6 * np.sin(a), -1.4 + 0.8 * a, 1.1 + 0.1 * np.sin(6 * a)] for a in angles]
-    return [look_at(p, [1.8 - a, 2.4 - 0.4 * a, 0.9]) for p, a in zip(positions, angles, strict=True)]
+    poses = []
+    for a in angles:
+        position = [-1.2 + 1.6 * np.sin(a), -1.4 + 0.8 * a, 1.1 + 0.1 * np.sin(6 * a)]
+        poses.append(look_at(position, [1.8 - a, 2.4 - 0.4 * a, 0.9]))
+    return poses
 
 
 def compiled(scene: Scene, folder: Path) -> Path:
@@ -153,7 +156,9 @@ def _poses_json(poses: list[np.ndarray]) -> str:
     # files of poses count pixels from the image's corner
     common = {"width": c.width, "height": c.height, "fx": c.fx, "fy": c.fy,
               "cx": c.cx + 0.5, "cy": c.cy + 0.5}  # fmt: skip
-    frames = [{"file": f"{i}.jpg", **common, "T_world_cam": T.tolist()} for i, T in enumerate(poses)]
+    frames = [
+        {"file": f"{i}.jpg", **common, "T_world_cam": T.tolist()} for i, T in enumerate(poses)
+    ]
     return json.dumps({"frames": frames})
 
 
@@ -192,8 +197,8 @@ def write_bag(scene: Scene, path: Path, count: int = 40) -> list[np.ndarray]:
         for index, T_map_cam in enumerate(poses):
             stamp_ns = START_NS + index * STEP_NS
             gain = 1 + 0.08 * np.sin(index / 5)  # exposure drifts
-            noisy = scene.photo(T_map_cam) * gain + rng.normal(0, 3, (CAMERA.height, CAMERA.width, 3))
-            rgb = np.clip(noisy, 0, 255).astype(np.uint8)
+            photo = scene.photo(T_map_cam)
+            rgb = np.clip(photo * gain + rng.normal(0, 3, photo.shape), 0, 255).astype(np.uint8)
             truth = PoseStamped(header=header(stamp_ns, "map"), pose=pose_to_ros(T_map_cam))
             odometry = Odometry(header=header(stamp_ns, "odom"), child_frame_id="base_link")
             odometry.pose.pose = pose_to_ros(T_odom_map @ T_map_cam @ inverse(T_base_cam))
