@@ -205,7 +205,14 @@ def _glue_input(features: Features) -> dict[str, torch.Tensor]:
 
 def _lighterglue_config(light_glue: Any) -> dict[str, Any]:
     """kornia's settings for XFeat, without pruning: on a CPU it costs more than it saves."""
-    return {**light_glue.features["xfeat"], "weights": None, "width_confidence": -1}
+    settings = {**light_glue.features["xfeat"], "weights": None, "width_confidence": -1}
+    return {**settings, "mp": _has_native_bfloat16()}
+
+
+def _has_native_bfloat16() -> bool:
+    """bfloat16 matching is 1.6 times faster where the CPU computes in it, slower elsewhere."""
+    query = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
+    return bool(query is not None and query())
 
 
 def _lighterglue_state(model: Any) -> dict[str, torch.Tensor]:

@@ -125,10 +125,19 @@ class Refiner:
             coverage=coverage,
             spread=_spread(uv[inliers], camera),
         )
-        covariance = pose_covariance(
-            camera, solution.T_scene_cam, points_scene[inliers], residuals
-        )
+        points_inlier = points_scene[inliers]
+        covariance = pose_covariance(camera, solution.T_scene_cam, points_inlier, residuals)
+        depths = transform_points(inverse(solution.T_scene_cam), points_inlier)[:, 2]
+        covariance = self._calibrated(covariance, float(np.median(depths)))
         return Refinement(solution.T_scene_cam, covariance, evidence)
+
+    def _calibrated(self, covariance: Array, median_depth: float) -> Array:
+        """The covariance with what the matches' scatter cannot show: the map's own errors."""
+        config = self._config
+        position = config.position_floor_rel * median_depth
+        rotation = np.radians(config.rotation_floor_deg)
+        floor = np.diag([position**2] * 3 + [rotation**2] * 3)
+        return config.covariance_inflation * covariance + floor
 
 
 def rendered_at(
