@@ -313,6 +313,8 @@ class _Watch:
         A pose and its status come on two topics: a status waits for its pose a little.
         """
         count = 0
+        if not self._listener.truth and not final:
+            return 0  # recorded stamps are found by the true poses
         while self._taken < len(self._listener.statuses):
             status = self._listener.statuses[self._taken]
             pose = self._pose_at(status.stamp_ns)
