@@ -22,6 +22,8 @@ _DISTORTION_SIZES: dict[str, tuple[int, ...]] = {
     "equidistant": (0, 4),
 }
 MODELS = tuple(_DISTORTION_SIZES)
+# half the widest view of an undistorted image: beyond it a pinhole spends its pixels on the rim
+_MAX_HALF_VIEW_DEG = 60.0
 
 
 @dataclass(frozen=True)
@@ -186,14 +188,18 @@ def _undistort_tables(
 
 
 def _inscribed_pinhole(camera: Camera) -> Camera:
-    """The widest pinhole of the same size and aspect whose whole image lies in the source."""
+    """The widest pinhole of the same size and aspect whose whole image lies in the source.
+
+    A fisheye may see 180 degrees and more, which no pinhole does: its view is cut there.
+    """
     w, h = camera.width, camera.height
     top = np.stack([np.linspace(0, w - 1, 65), np.zeros(65)], 1)
     left = np.stack([np.zeros(65), np.linspace(0, h - 1, 65)], 1)
-    x_left = camera.normalized(left)[:, 0].max()
-    x_right = camera.normalized(left + [w - 1, 0])[:, 0].min()
-    y_top = camera.normalized(top)[:, 1].max()
-    y_bottom = camera.normalized(top + [0, h - 1])[:, 1].min()
+    limit = np.tan(np.radians(_MAX_HALF_VIEW_DEG))
+    x_left = max(camera.normalized(left)[:, 0].max(), -limit)
+    x_right = min(camera.normalized(left + [w - 1, 0])[:, 0].min(), limit)
+    y_top = max(camera.normalized(top)[:, 1].max(), -limit)
+    y_bottom = min(camera.normalized(top + [0, h - 1])[:, 1].min(), limit)
     if not (x_left < x_right and y_top < y_bottom):
         raise CameraError(
             f"camera: {camera.model} coefficients {camera.dist} leave no undistorted image"

@@ -160,8 +160,10 @@ class Sim3:
         if M.shape != (4, 4) or not np.isfinite(M).all() or np.linalg.det(M[:3, :3]) <= 0:
             raise ValueError("no similarity transform: 4x4, finite, positive determinant wanted")
         scale = float(np.cbrt(np.linalg.det(M[:3, :3])))
-        if not is_rigid(compose(M[:3, :3] / scale, M[:3, 3])) or M[3, 3] != 1:
-            raise ValueError("no similarity transform: its 3x3 part is no scaled rotation")
+        if not is_rigid(np.vstack([np.hstack([M[:3, :3] / scale, M[:3, 3:]]), M[3]])):
+            raise ValueError(
+                "no similarity transform: a scaled rotation and a last row 0 0 0 1 wanted"
+            )
         return Sim3(scale, M[:3, :3] / scale, M[:3, 3].copy())
 
     def matrix(self) -> Array:
@@ -179,4 +181,5 @@ class Sim3:
     def camera(self, T_b_cam: ArrayLike) -> Array:
         """T_a_cam of a camera pose T_b_cam: the axes rotate, the position scales too."""
         T = np.asarray(T_b_cam, np.float64)
-        return compose(self.rotation @ T[:3, :3], self.matrix()[:3, :3] @ T[:3, 3] + self.translation)
+        position = self.scale * (self.rotation @ T[:3, 3]) + self.translation
+        return compose(self.rotation @ T[:3, :3], position)
