@@ -54,9 +54,10 @@ class Listener(Node):
         self,
         localizer: str = "/localizer",
         truth_topic: str | None = "/ground_truth/pose",
+        name: str = "localizer_listener",
         **node_arguments: Any,
     ) -> None:
-        super().__init__("localizer_listener", **node_arguments)
+        super().__init__(name, **node_arguments)
         self.poses: list[HeardPose] = []
         self.truth: list[HeardPose] = []
         self.statuses: list[HeardStatus] = []

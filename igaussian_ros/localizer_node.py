@@ -76,7 +76,7 @@ class LocalizerNode(Node):
         self._state = "no map"
         self._map_name = ""
         self._camera_frame = str(self._settings["camera_optical_frame"])
-        self._paused = False
+        self._paused = self._stopping = False
         self._loader: threading.Thread | None = None
         self._loading = threading.Lock()
         self._begin = self._last_image = time.monotonic()
@@ -208,6 +208,8 @@ class LocalizerNode(Node):
         except IGaussianError as error:
             return False, str(error)
         except Exception as error:  # a defect, yet the old map still serves
+            if self._stopping:
+                return False, "the node is stopping"
             self.get_logger().error(traceback.format_exc())
             return False, f"{path}: {type(error).__name__}: {error}"
         text = f"map {path} loaded in {time.monotonic() - begin:.1f} s"
@@ -549,6 +551,7 @@ class LocalizerNode(Node):
 
     def stop(self, timeout_s: float = _SHUTDOWN_S) -> bool:
         """Finish the frame at hand and end the threads; False where one still runs."""
+        self._stopping = True
         deadline = time.monotonic() + timeout_s
         stopped = self._worker.stop(timeout_s)
         if self._loader is not None:
@@ -595,7 +598,8 @@ class _Run:
         self.over.set()
 
     def on_failure(self, text: str) -> None:
-        self.failure = text
+        if not self.over.is_set():
+            self.failure = text
         self.over.set()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -158,4 +159,4 @@ def _stale_text(age_ms: float, limit_s: float) -> str:
 
 def _key(error: IGaussianError) -> str:
     # equal mistakes share a key though their texts may carry changing numbers
-    return f"{type(error).__name__}:{str(error)[:24]}"
+    return re.sub(r"\d+", "#", str(error))

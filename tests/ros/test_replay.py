@@ -73,8 +73,8 @@ def test_bytes_are_those_recorded(ros, corner, tmp_path):
 
 def test_part_loops_remapping_and_raw_images(ros, corner, tmp_path):
     ear = Ear(other=Image)
-    arguments = ["--start", "1.0", "--duration", "0.55", "--loop", "2", "--rate", "4", "--raw",
-                 "--remap", "/camera/image_raw:=/other", "--wait-for-subscribers", "10"]  # fmt: skip
+    arguments = ["--start", "1", "--duration", "0.55", "--loop", "2", "--rate", "4", "--raw",
+                 "--remap=/camera/image_raw:=/other", "--wait-for-subscribers=10"]  # fmt: skip
     with Spinning(ear), replay_process(tmp_path, corner.bag, *arguments) as player:
         assert player.popen.wait(30) == 0, player.log
         assert wait_until(lambda: len(ear.heard["/other"]) == 12, 5)
