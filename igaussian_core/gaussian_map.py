@@ -118,7 +118,7 @@ def load_map(path: str | os.PathLike[str]) -> GaussianMap:
     if "vertex" not in ply:
         raise MapError(f"{file}: no element 'vertex'; supported: .ply of 3D Gaussians")
     vertex = ply["vertex"].data
-    _check_properties(file, set(vertex.dtype.names or ()))
+    _check_properties(file, vertex.dtype)
     return _validated(file, _from_vertex(file, vertex, _is_antialiased(ply)))
 
 
@@ -156,7 +156,8 @@ def _digest(chunks: Iterable[bytes]) -> str:
     return digest.hexdigest()
 
 
-def _check_properties(file: Path, names: set[str]) -> None:
+def _check_properties(file: Path, dtype: np.dtype[Any]) -> None:
+    names = set(dtype.names or ())
     needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
     needed += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
     missing = [name for name in needed if name not in names]
@@ -171,6 +172,10 @@ def _check_properties(file: Path, names: set[str]) -> None:
             f"{file}: {rest} f_rest properties; spherical harmonics of degree 0 to 3 have "
             f"{', '.join(map(str, _SH_COEFFICIENTS))}"
         )
+    needed += [f"f_rest_{i}" for i in range(rest)]
+    unusable = [name for name in needed if name not in names or dtype[name].kind not in "fiu"]
+    if unusable:
+        raise MapError(f"{file}: properties {', '.join(unusable)} are missing or no plain numbers")
 
 
 def _is_antialiased(ply: plyfile.PlyData) -> bool:

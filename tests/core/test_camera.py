@@ -143,9 +143,7 @@ def test_undistorted_keeps_most_of_the_view(camera: Camera) -> None:
     """No black border at the price of a needlessly narrow view would be easy."""
     pinhole = camera.undistorted()
     corners = np.array([[0, 0], [639, 0], [639, 479], [0, 479]], float)
-    edges = np.concatenate(
-        [np.linspace(corners[i], corners[(i + 1) % 4], 200) for i in range(4)]
-    )
+    edges = np.concatenate([np.linspace(corners[i], corners[(i + 1) % 4], 200) for i in range(4)])
     ray = np.concatenate([pinhole.normalized(edges), np.ones((len(edges), 1))], 1)
     u, v = camera.project(ray).T
     assert u.min() > -0.6 and v.min() > -0.6 and u.max() < 639.6 and v.max() < 479.6
