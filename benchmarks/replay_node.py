@@ -1,6 +1,6 @@
 """Figures of a recording replayed through the node over DDS, both in processes of their own.
 
-    python benchmarks/replay_node.py BAG --map MAP.igmap [--compressed] [--rate 1.0] [--raw]
+    python benchmarks/replay_node.py BAG --map MAP.igmap [--rate 1.0] [--raw] [--odometry]
 
 Stamps are moved to the present, so that a latency is wall time from an image's stamp to the
 arrival of its pose at a third process, transport included. Prints one JSON object.
@@ -23,6 +23,9 @@ import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
+from igaussian_core.bags import Bag, T_from_chain
+from igaussian_core.geometry import inverse
+from igaussian_ros.convert import pose_to_ros
 from igaussian_ros.listener import Listener
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -38,6 +41,9 @@ def main() -> int:
     parser.add_argument("--raw", action="store_true", help="raw images over DDS, not JPEG")
     parser.add_argument("--stamp", choices=("now", "bag"), default="now")
     parser.add_argument("--param", action="append", default=[], metavar="NAME:=VALUE")
+    parser.add_argument(
+        "--odometry", action="store_true", help="use /odom, and base_to_camera of /tf_static"
+    )
     parser.add_argument("--errors", action="store_true", help="list every pose's error")
     options = parser.parse_args()
 
@@ -46,7 +52,8 @@ def main() -> int:
     os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(PROFILE))
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
 
-    rclpy.init()
+    options.T_base_cam = _extrinsic(options.bag) if options.odometry else None
+    rclpy.init(args=[])
     listener = Listener()
     executor = SingleThreadedExecutor()
     executor.add_node(listener)
@@ -57,7 +64,7 @@ def main() -> int:
         _wait(lambda: listener.diagnostics.get("map", "") != "", 120, node)
         subprocess.run(_replay_command(options), check=True)
         time.sleep(2.5)  # the last frames, and diagnostics of them
-        figures = _figures(listener)
+        figures = _figures(listener, options.T_base_cam)
     finally:
         node.send_signal(signal.SIGINT)
         try:
@@ -77,6 +84,15 @@ def main() -> int:
     return 0
 
 
+def _extrinsic(bag: str) -> np.ndarray:
+    """T_base_cam of the recording's /tf_static."""
+    with Bag(bag) as recording:
+        T = T_from_chain(recording.static_transforms(), "base_link", "camera_optical_frame")
+    if T is None:
+        raise SystemExit(f"{bag}: no transform base_link -> camera_optical_frame in /tf_static")
+    return T
+
+
 def _spin(executor: SingleThreadedExecutor) -> None:
     with contextlib.suppress(ExternalShutdownException):
         executor.spin()
@@ -89,6 +105,11 @@ def _node_command(options: argparse.Namespace) -> list[str]:
         f"use_sim_time:={str(options.stamp == 'bag').lower()}",
         *options.param,
     ]
+    if options.T_base_cam is not None:
+        message = pose_to_ros(options.T_base_cam)
+        t, q = message.position, message.orientation
+        parameters.append(f"base_to_camera:={[t.x, t.y, t.z, q.x, q.y, q.z, q.w]}")
+        parameters.append("odom_topic:=/odom")
     command = [sys.executable, "-m", "igaussian_ros.localizer_node", "--ros-args"]
     return command + [word for parameter in parameters for word in ("-p", parameter)]
 
@@ -107,9 +128,10 @@ def _wait(condition, timeout_s: float, node: subprocess.Popen) -> None:  # type:
         time.sleep(0.1)
 
 
-def _figures(listener: Listener) -> dict[str, float | int | str]:
+def _figures(listener: Listener, T_base_cam: np.ndarray | None) -> dict[str, float | int | str]:
     poses, diagnostics = listener.poses, listener.diagnostics
-    errors = np.array(listener.errors()).reshape(-1, 2)
+    T_cam_base = None if T_base_cam is None else inverse(T_base_cam)
+    errors = np.array(listener.errors(T_cam_base)).reshape(-1, 2)
     latencies = [pose.latency_ms for pose in poses]
     span_s = (poses[-1].received_ns - poses[0].received_ns) * 1e-9 if len(poses) > 1 else 0.0
     processed = sum("inliers" in status.values for status in listener.statuses)

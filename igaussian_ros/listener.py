@@ -69,13 +69,19 @@ class Listener(Node):
         if truth_topic is not None:
             self.create_subscription(PoseStamped, truth_topic, self._on_truth, qos)
 
-    def errors(self) -> list[tuple[float, float]]:
-        """(degrees, metres) of each pose whose time the true poses cover."""
+    def errors(self, T_true_child: NDArray[np.float64] | None = None) -> list[tuple[float, float]]:
+        """(degrees, metres) of each pose whose time the true poses cover.
+
+        Args:
+            T_true_child: from the frame that the localizer publishes to that of the true
+                poses, where these differ.
+        """
         result = []
         for pose in self.poses:
             T_true = interpolated(self.truth, pose.stamp_ns)
             if T_true is not None:
-                result.append(pose_error(pose.T, T_true))
+                T = T_true if T_true_child is None else T_true @ T_true_child
+                result.append(pose_error(pose.T, T))
         return result
 
     def _on_pose(self, message: PoseStamped) -> None:

@@ -283,14 +283,19 @@ class LocalizerNode(Node):
         )
 
     def _on_odometry(self, message: Odometry) -> None:
-        settings = self._settings
-        T_x_cam = self._camera_in(message.child_frame_id)
+        settings, child = self._settings, message.child_frame_id
+        T_x_cam = self._camera_in(child)
         if T_x_cam is None or message.header.frame_id != settings["odom_frame"]:
+            no_extrinsic = child == settings["base_frame"] and settings.T_base_cam is None
+            wanted = (
+                "base_to_camera is not given"
+                if no_extrinsic
+                else f"wanted is base_frame '{settings['base_frame']}' or the camera's optical "
+                f"frame, in odom_frame '{settings['odom_frame']}'"
+            )
             self._warn(
                 "odometry:frames",
-                f"odometry of '{message.child_frame_id}' in '{message.header.frame_id}' is not "
-                f"used: wanted is '{settings['base_frame']}' (with base_to_camera given) or the "
-                f"camera's optical frame, in '{settings['odom_frame']}'",
+                f"odometry of '{child}' in '{message.header.frame_id}' is not used: {wanted}",
             )
             return
         try:
