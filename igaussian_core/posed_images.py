@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igaussian_core.camera import Camera
-from igaussian_core.errors import DatasetError
+from igaussian_core.errors import CameraError, DatasetError
 from igaussian_core.geometry import compose, inverse, is_rigid, rotation_from_quaternion
 
 SUPPORTED = (
@@ -82,7 +82,8 @@ def read_image(
         return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BGR2RGB), np.uint8)
     rgba = cv2.cvtColor(raw, cv2.COLOR_BGRA2RGBA).astype(np.float32)
     alpha = rgba[..., 3:] / 255
-    return np.asarray(np.rint(rgba[..., :3] * alpha + np.float32(background) * (1 - alpha)), np.uint8)
+    blended = rgba[..., :3] * alpha + np.float32(background) * (1 - alpha)
+    return np.asarray(np.rint(blended), np.uint8)
 
 
 def read_posed_images(path: str | Path) -> list[PosedImage]:
@@ -96,7 +97,9 @@ def read_posed_images(path: str | Path) -> list[PosedImage]:
         frames = list(_read(file))
     except DatasetError:
         raise
-    except (OSError, KeyError, ValueError, TypeError, IndexError, struct.error) as error:
+    except CameraError as error:
+        raise DatasetError(f"{file}: {error}") from error
+    except (OSError, LookupError, ValueError, TypeError, AttributeError, struct.error) as error:
         cause = f"{type(error).__name__}: {error}"
         raise DatasetError(f"{file}: no camera poses ({cause}); supported: {SUPPORTED}") from error
     if not frames:
@@ -171,13 +174,26 @@ def _nerf_frame(file: Path, data: dict[str, Any], e: dict[str, Any]) -> PosedIma
         if angle is None:
             raise DatasetError(f"{file}: neither 'fl_x' nor 'camera_angle_x'")
         fx = 0.5 * width / np.tan(0.5 * angle)
+    model, names = _nerf_lens(file, e.get("camera_model", data.get("camera_model", "OPENCV")),
+                              bool(value("is_fisheye")))  # fmt: skip
+    dist = tuple(float(value(k, 0.0) or 0) for k in names)
     camera = _corner_camera(
         int(width), int(height), float(fx), float(value("fl_y", fx) or fx),
-        float(value("cx", width / 2) or 0), float(value("cy", height / 2) or 0),
-        dist=tuple(float(value(k, 0.0) or 0) for k in ("k1", "k2", "p1", "p2")),
+        float(value("cx", width / 2) or 0), float(value("cy", height / 2) or 0), model,
+        dist if model == "equidistant" or dist[-1] else dist[:-1],
     )  # fmt: skip
     T_scene_cam = np.array(e["transform_matrix"], float) @ _OPENCV_FROM_OPENGL
     return PosedImage(e["file_path"], path, camera, T_scene_cam)
+
+
+def _nerf_lens(file: Path, name: str, is_fisheye: bool) -> tuple[str, tuple[str, ...]]:
+    """Our model and the keys of its coefficients for nerfstudio's or instant-ngp's lens."""
+    if is_fisheye or name == "OPENCV_FISHEYE":
+        return "equidistant", ("k1", "k2", "k3", "k4")
+    if name in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
+        return "plumb_bob", ("k1", "k2", "p1", "p2", "k3")
+    raise DatasetError(f"{file}: camera_model {name} is not supported; supported: OPENCV, "
+                       "OPENCV_FISHEYE, PINHOLE, SIMPLE_PINHOLE")  # fmt: skip
 
 
 def _inria_frame(file: Path, e: dict[str, Any]) -> PosedImage:
@@ -199,7 +215,7 @@ def _read_colmap(model: Path, suffix: str, root: Path) -> Iterator[PosedImage]:
 
 def _colmap_camera(model: str, width: int, height: int, p: tuple[float, ...]) -> Camera:
     if model not in _COLMAP_MODELS:
-        raise DatasetError(
+        raise CameraError(
             f"COLMAP camera model {model} is not supported; supported: {', '.join(_COLMAP_MODELS)}"
         )
     if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
@@ -214,6 +230,15 @@ def _unpack(stream: BinaryIO, layout: str) -> tuple[Any, ...]:
     return struct.unpack("<" + layout, stream.read(struct.calcsize("<" + layout)))
 
 
+def _unpack_name(stream: BinaryIO) -> str:
+    name = b""
+    while (letter := stream.read(1)) != b"\0":
+        if not letter:
+            raise ValueError("the file ends inside an image's name")
+        name += letter
+    return name.decode()
+
+
 def _colmap_cameras_bin(model: Path) -> dict[int, Camera]:
     by_id = {number: (name, count) for name, (number, count, _) in _COLMAP_MODELS.items()}
     cameras = {}
@@ -221,7 +246,7 @@ def _colmap_cameras_bin(model: Path) -> dict[int, Camera]:
         for _ in range(_unpack(stream, "Q")[0]):
             camera_id, model_id, width, height = _unpack(stream, "iiQQ")
             if model_id not in by_id:
-                raise DatasetError(f"{model}: COLMAP camera model number {model_id} unsupported")
+                raise CameraError(f"COLMAP camera model number {model_id} is not supported")
             name, count = by_id[model_id]
             cameras[camera_id] = _colmap_camera(name, width, height, _unpack(stream, f"{count}d"))
     return cameras
@@ -231,7 +256,7 @@ def _colmap_images_bin(model: Path) -> Iterator[tuple[str, int, Any, Any]]:
     with open(model / "images.bin", "rb") as stream:
         for _ in range(_unpack(stream, "Q")[0]):
             _, *pose, camera_id = _unpack(stream, "i7di")
-            name = b"".join(iter(lambda: stream.read(1), b"\0")).decode()
+            name = _unpack_name(stream)
             stream.seek(24 * _unpack(stream, "Q")[0], 1)
             yield name, camera_id, pose[:4], pose[4:]
 
