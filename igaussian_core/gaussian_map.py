@@ -1,30 +1,29 @@
-"""Gaussian maps: the arrays, their validation, and .ply files in and out.
+"""Gaussian maps: the arrays, their validation, and map files in and out.
 
 Values are kept activated: linear scales, opacities in [0, 1], unit quaternions wxyz.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import logging
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import plyfile
 from numpy.typing import ArrayLike, NDArray
 
 from igaussian_core.camera import Camera
 from igaussian_core.errors import MapError
+from igaussian_core.formats import RawGaussians, ply, read_gaussians, spz
 from igaussian_core.render import Rasterizer, Render
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float32]
 
-_SH_COEFFICIENTS = {0: 0, 9: 1, 24: 2, 45: 3}  # number of f_rest properties -> degree
 _MAX_BAD_SHARE = 0.5
 
 
@@ -40,6 +39,8 @@ class GaussianMap:
         sh: [N, K, 3] float32 spherical harmonics of the colour, K in 1, 4, 9, 16.
         antialiased: trained with the low-pass filter's opacity compensation (Mip-Splatting).
         dropped: Gaussians left out on loading, since they were not finite or had no rotation.
+        file_format: what kind of file the map was read from, "" where it was made in memory.
+        vertical_axis: "x", "y" or "z" where the file named the axis that points up, else "".
     """
 
     means: Array
@@ -49,6 +50,8 @@ class GaussianMap:
     sh: Array
     antialiased: bool = False
     dropped: int = 0
+    file_format: str = ""
+    vertical_axis: str = ""
     _rasterizer: Rasterizer | None = field(default=None, repr=False, compare=False)
 
     def __len__(self) -> int:
@@ -57,6 +60,14 @@ class GaussianMap:
     @property
     def sh_degree(self) -> int:
         return int(np.sqrt(self.sh.shape[1])) - 1
+
+    def subset(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> GaussianMap:
+        """The Gaussians of a mask [N] or of indices, in a map of their own."""
+        return dataclasses.replace(
+            self, means=self.means[index], quats_wxyz=self.quats_wxyz[index],
+            scales=self.scales[index], opacities=self.opacities[index], sh=self.sh[index],
+            _rasterizer=None,
+        )  # fmt: skip
 
     def rasterizer(self) -> Rasterizer:
         """The renderer of this map, packed on first use; not for two threads at once."""
@@ -97,50 +108,36 @@ class GaussianMap:
 
 
 def load_map(path: str | os.PathLike[str]) -> GaussianMap:
-    """Read a Gaussian map from a .ply file.
+    """Read a Gaussian map from a file of any format in `igaussian_core.formats`.
 
-    INRIA's layout in any order of properties, binary or ascii, float or double, SH degree 0
-    to 3, with or without normals and extra properties; Mip-Splatting's filter_3D is applied.
+    The content decides what a file is, its name only where the content does not tell. The map
+    is in the frame of the INRIA .ply that the file came from.
 
     Raises:
         MapError: missing, truncated, no Gaussian map, or mostly not finite.
     """
-    file = Path(path)
-    if not file.is_file():
-        raise MapError(f"{file}: no such file")
-    try:
-        ply = plyfile.PlyData.read(str(file))
-    except (plyfile.PlyParseError, ValueError, OSError, EOFError, UnicodeDecodeError) as error:
-        raise MapError(
-            f"{file}: not a readable .ply ({error or type(error).__name__}); "
-            "supported: .ply of 3D Gaussians"
-        ) from error
-    if "vertex" not in ply:
-        raise MapError(f"{file}: no element 'vertex'; supported: .ply of 3D Gaussians")
-    vertex = ply["vertex"].data
-    _check_properties(file, vertex.dtype)
-    return _validated(file, _from_vertex(file, vertex, _is_antialiased(ply)))
+    return _validated(Path(path), read_gaussians(Path(path)))
 
 
 def save_ply(gmap: GaussianMap, path: str | os.PathLike[str]) -> None:
     """Write INRIA's binary little-endian .ply (float32, no normals)."""
-    count, coefficients = len(gmap), gmap.sh.shape[1]
-    rest = np.transpose(gmap.sh[:, 1:], (0, 2, 1)).reshape(count, -1)
-    opacity = np.clip(gmap.opacities.astype(np.float64), 1e-7, 1 - 1e-7)
-    columns: list[tuple[str, NDArray[Any]]] = [
-        *zip("xyz", gmap.means.T, strict=True),
-        *((f"f_dc_{i}", gmap.sh[:, 0, i]) for i in range(3)),
-        *((f"f_rest_{i}", rest[:, i]) for i in range(3 * (coefficients - 1))),
-        ("opacity", np.log(opacity / (1 - opacity))),
-        *((f"scale_{i}", np.log(np.maximum(gmap.scales[:, i], 1e-30))) for i in range(3)),
-        *((f"rot_{i}", gmap.quats_wxyz[:, i]) for i in range(4)),
-    ]
-    vertex = np.empty(count, dtype=[(name, "<f4") for name, _ in columns])
-    for name, values in columns:
-        vertex[name] = values
-    comments = ["SplatRenderMode: mip"] if gmap.antialiased else []
-    element = plyfile.PlyElement.describe(vertex, "vertex")
-    plyfile.PlyData([element], byte_order="<", comments=comments).write(str(path))
+    ply.write(_as_raw(gmap), Path(path))
+
+
+def save_map(gmap: GaussianMap, path: str | os.PathLike[str]) -> None:
+    """Write .ply or .spz, as the name ends; docs/map-formats.md has what .spz loses.
+
+    Raises:
+        MapError: another suffix, or a place that cannot be written.
+    """
+    writers = {".ply": ply.write, ".spz": spz.write}
+    writer = writers.get(Path(path).suffix.lower())
+    if writer is None:
+        raise MapError(f"{path}: cannot write this format; supported: {', '.join(writers)}")
+    try:
+        writer(_as_raw(gmap), Path(path))
+    except OSError as error:
+        raise MapError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def file_sha256(path: str | os.PathLike[str]) -> str:
@@ -156,83 +153,33 @@ def _digest(chunks: Iterable[bytes]) -> str:
     return digest.hexdigest()
 
 
-def _check_properties(file: Path, dtype: np.dtype[Any]) -> None:
-    names = set(dtype.names or ())
-    needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    needed += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
-    missing = [name for name in needed if name not in names]
-    if missing:
-        raise MapError(
-            f"{file}: no 3D Gaussian map: properties {', '.join(missing)} are missing "
-            "(a plain point cloud or mesh cannot be localized against)"
-        )
-    rest = sum(name.startswith("f_rest_") for name in names)
-    if rest not in _SH_COEFFICIENTS:
-        raise MapError(
-            f"{file}: {rest} f_rest properties; spherical harmonics of degree 0 to 3 have "
-            f"{', '.join(map(str, _SH_COEFFICIENTS))}"
-        )
-    needed += [f"f_rest_{i}" for i in range(rest)]
-    unusable = [name for name in needed if name not in names or dtype[name].kind not in "fiu"]
-    if unusable:
-        raise MapError(f"{file}: properties {', '.join(unusable)} are missing or no plain numbers")
+def _as_raw(gmap: GaussianMap) -> RawGaussians:
+    return RawGaussians(
+        gmap.means, gmap.quats_wxyz, gmap.scales, gmap.opacities, gmap.sh, gmap.antialiased,
+        vertical_axis=gmap.vertical_axis,
+    )  # fmt: skip
 
 
-def _is_antialiased(ply: plyfile.PlyData) -> bool:
-    return any("splatrendermode: mip" in comment.lower() for comment in ply.comments)
-
-
-def _from_vertex(file: Path, vertex: NDArray[Any], antialiased: bool) -> GaussianMap:
-    def columns(*names: str) -> NDArray[np.float64]:
-        return np.stack([np.asarray(vertex[n], np.float64) for n in names], axis=-1)
-
-    rest = sum(name.startswith("f_rest_") for name in vertex.dtype.names or ())
-    sh = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :]
-    if rest:
-        # the file counts channel by channel: f_rest_{c * (K - 1) + k}
-        high = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(len(vertex), 3, rest // 3)
-        sh = np.concatenate([sh, np.transpose(high, (0, 2, 1))], axis=1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        scales = np.exp(columns("scale_0", "scale_1", "scale_2"))
-        opacities = 1 / (1 + np.exp(-columns("opacity")[:, 0]))
-        if "filter_3D" in (vertex.dtype.names or ()):
-            scales, opacities = _apply_filter_3d(scales, opacities, columns("filter_3D"))
-        return GaussianMap(
-            columns("x", "y", "z").astype(np.float32),
-            columns("rot_0", "rot_1", "rot_2", "rot_3").astype(np.float32),
-            scales.astype(np.float32),
-            opacities.astype(np.float32),
-            sh.astype(np.float32),
-            antialiased,
-        )
-
-
-def _apply_filter_3d(
-    scales: NDArray[np.float64], opacities: NDArray[np.float64], filter_3d: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mip-Splatting's 3D smoothing filter (Yu et al., 2024, eq. 9): wider, less opaque."""
-    wide = np.sqrt(scales**2 + filter_3d**2)
-    return wide, opacities * np.prod(scales / np.maximum(wide, 1e-30), axis=1)
-
-
-def _validated(file: Path, gmap: GaussianMap) -> GaussianMap:
+def _validated(file: Path, raw: RawGaussians) -> GaussianMap:
     """The map without its unusable Gaussians, quaternions of unit length."""
-    parts = (gmap.means, gmap.quats_wxyz, gmap.scales, gmap.opacities[:, None])
-    norms = np.linalg.norm(gmap.quats_wxyz.astype(np.float64), axis=1)
-    good = np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
-    good &= np.isfinite(gmap.sh).all(axis=(1, 2)) & (norms > 1e-9)
-    bad = int(len(gmap) - good.sum())
-    if bad > _MAX_BAD_SHARE * len(gmap):
+    norms = np.linalg.norm(raw.quats_wxyz.astype(np.float64), axis=1)
+    good = np.isfinite(norms) & (norms > 1e-9) & np.isfinite(raw.opacities)
+    for part in (raw.means, raw.scales, raw.sh):
+        good &= np.isfinite(part).all(axis=tuple(range(1, part.ndim)))
+    bad = int(len(good) - good.sum())
+    if bad > _MAX_BAD_SHARE * len(good):
         raise MapError(
-            f"{file}: {bad} of {len(gmap)} Gaussians are not finite or have no rotation: "
+            f"{file}: {bad} of {len(good)} Gaussians are not finite or have no rotation: "
             "the file is damaged"
         )
-    if bad:
-        log.warning("%s: left out %d of %d Gaussians (not finite or no rotation)",
-                    file, bad, len(gmap))  # fmt: skip
     with np.errstate(invalid="ignore", divide="ignore"):
-        quats = (gmap.quats_wxyz / norms[:, None]).astype(np.float32)
-    return GaussianMap(
-        gmap.means[good], quats[good], gmap.scales[good], gmap.opacities[good], gmap.sh[good],
-        gmap.antialiased, bad,
+        quats = (raw.quats_wxyz / norms[:, None]).astype(np.float32)
+    gmap = GaussianMap(
+        raw.means, quats, raw.scales, raw.opacities, raw.sh, raw.antialiased, bad,
+        raw.file_format, raw.vertical_axis,
     )  # fmt: skip
+    if bad == 0:
+        return gmap
+    log.warning("%s: left out %d of %d Gaussians (not finite or no rotation)",
+                file, bad, len(good))  # fmt: skip
+    return gmap.subset(good)
