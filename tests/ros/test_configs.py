@@ -11,7 +11,9 @@ from xml.etree import ElementTree
 import pytest
 from ruamel.yaml import YAML
 
-from igaussian_ros.parameters import all_options
+from igaussian_core.result import Status
+from igaussian_ros.diagnostics import OUTCOMES
+from igaussian_ros.parameters import ROS_OPTIONS, all_options
 
 OUTPUTS = {
     "/localizer/pose", "/localizer/pose_with_covariance", "/localizer/status",
@@ -109,3 +111,14 @@ def test_the_launch_file_passes_only_parameters_that_exist(launch_file, monkeypa
     overrides = node.kwargs["parameters"][1]
     assert set(overrides) - {"use_sim_time"} <= set(all_options())
     assert overrides["publish_tf"] is True
+
+
+def test_the_documentation_lists_ros_parameters_with_their_defaults(repo_root):
+    text = (repo_root / "docs" / "ros.md").read_text()
+    for name, option in ROS_OPTIONS.items():
+        value = json.dumps(option.default) if option.default in ("", [], False) else option.default
+        assert f"| `{name}` | `{value}` |" in text, name
+    for outcome in OUTCOMES:
+        assert f"_{outcome}`" in text or f"`{outcome}`" in text, outcome
+    for status in Status:
+        assert f"`{status.value}`" in text, status
