@@ -85,14 +85,12 @@ inline void file(Bins* bins, int tile, uint64_t key) {
   chunk->keys[chunk->size++] = key;
 }
 
-// W projected Gaussians, one vector for each member of Splat from u to dy_right.
-struct Projected {
-  static constexpr int kFields = 14;
-  alignas(64) float field[kFields][W];
+// W projected Gaussians.
+struct alignas(64) Projected {
+  float lines[W][16];                  // Splats, but for the index
   int32_t x0[W], x1[W], y0[W], y1[W];  // tiles touched, inclusive
   unsigned visible;
 };
-
 inline void project_lanes(const Model& model, const View& view, const Bins& bins, size_t block,
                           int lane, Projected* out) {
   const float* mean = model.mean + block * 3 * kBlock + lane;
@@ -158,11 +156,6 @@ inline void project_lanes(const Model& model, const View& view, const Bins& bins
   out->visible = bits(visible);
   if (!out->visible) return;
 
-  const F inv_det = splat(1.0f) / det;
-  const F log2e = splat(1.4426950408889634f), half = splat(0.5f);
-  const F a = -half * log2e * cyy * inv_det, c = -half * log2e * cxx * inv_det;
-  const F b = log2e * sxy * inv_det;
-
   const F dx = X - splat(view.centre[0]), dy = Y - splat(view.centre[1]),
           dz = Z - splat(view.centre[2]);
   const F inv_distance = splat(1.0f) / root(dx * dx + dy * dy + dz * dz);
@@ -171,12 +164,27 @@ inline void project_lanes(const Model& model, const View& view, const Bins& bins
   colour_of_degree(model, block * 3 * kBlock * sh_count + lane, dx * inv_distance,
                    dy * inv_distance, dz * inv_distance, rgb);
 
-  const F slope = sxy / cyy;
-  const F root2 = -det / (cyy * cyy), root0 = reach * det / cyy;
-  const F fields[Projected::kFields] = {u,      v,      a,      b, c,     lo,    rgb[0],
-                                        rgb[1], rgb[2], z,      slope, root0, root2,
-                                        sxy / cxx * hx};
-  for (int k = 0; k < Projected::kFields; ++k) store(out->field[k], fields[k]);
+  const F inv_cyy = splat(1.0f) / cyy;
+  const F half_log2e = splat(0.5f * 1.4426950408889634f);
+  const F inv_along = root(det * inv_cyy / half_log2e), along = splat(1.0f) / inv_along;
+  const F slope = sxy * inv_cyy;
+  const F fields[16] = {u,
+                        v,
+                        along,
+                        -along * slope,
+                        root(half_log2e * inv_cyy),
+                        lo,
+                        rgb[0],
+                        rgb[1],
+                        rgb[2],
+                        z,
+                        slope,
+                        sxy * hx / cxx,
+                        inv_along,
+                        zero,
+                        zero,
+                        zero};
+  to_lines(fields, out->lines[0]);
   const F per_tile = splat(1.0f / kTile);
   store_int(out->x0, larger(left, zero) * per_tile);
   store_int(out->y0, larger(top, zero) * per_tile);
@@ -196,8 +204,7 @@ void project(const Model& model, const View& view, int64_t super_block, Splat* s
       for (unsigned m = lanes.visible; m; m &= m - 1) {
         const int l = __builtin_ctz(m);
         Splat* s = splats + count;
-        float* fields = &s->u;
-        for (int k = 0; k < Projected::kFields; ++k) fields[k] = lanes.field[k][l];
+        std::memcpy(static_cast<void*>(s), lanes.lines[l], sizeof(Splat));
         s->index = model.index[block * kBlock + lane + l];
         uint32_t depth;
         std::memcpy(&depth, &s->z, 4);
@@ -216,40 +223,74 @@ void project(const Model& model, const View& view, int64_t super_block, Splat* s
 
 // ---------------------------------------------------------------- blending
 
-// Bit 8 * row + column of each cell of the tile that the ellipse alpha >= 1/255 meets.
-// (x, y): the Gaussian's centre from the tile's first pixel centre.
-inline uint64_t cells_touched(const Splat& s, float x, float y) {
-  constexpr float kSlack = 0.01f;  // rounding may add a cell, never lose a pixel
-  int32_t row_bits[8];
+constexpr int kBatch = 1024;
+
+// The next Gaussians of one tile, front to back, and the cells of the tile that each touches.
+struct alignas(64) Batch {
+  Splat splats[kBatch + 1];   // the last is invisible: lists are filled up with it
+  uint32_t cells[2][kBatch];  // bit 8 * row + column: rows 0 to 3, rows 4 to 7
+  uint32_t row[kBatch + 16];  // those that touch one row of cells: number, columns << 16
+  uint32_t list[kBatch + 16]; // those that touch one cell: number
+};
+
+// Cells that the ellipses alpha >= 1/255 of Gaussians i ... i + W - 1 meet. Over a row of cells
+// the ellipse reaches farthest right at dy_right, clamped to the row's pixel centres, farthest
+// left at -dy_right.
+inline void cells_touched(Batch* batch, int i, float tile_u, float tile_v) {
+  constexpr int kFields[] = {0, 1, 4, 5, 10, 11, 12};
+  F fields[7];
+  from_lines(&batch->splats[i].u, kFields, fields);
+  const F u = fields[0] - splat(tile_u), v = fields[1] - splat(tile_v);
+  const F curve = fields[2] * fields[2], reach = fields[3] - splat(kLog2AlphaMin);
+  const F slope = fields[4], dy_right = fields[5], inv_along = fields[6];
+  // rounding may add a cell, never lose a pixel
+  const F slack = splat(0.01f), widened = inv_along * splat(1.0005f);
+  const F zero = splat(0.0f), eight = splat(8.0f), quarter = splat(0.25f), tiny = splat(1e-12f);
+  I words[2];
   for (int row = 0; row < 8; ++row) {
-    const float low = row * float(kCell) - y, high = low + (kCell - 1);
-    float at_right = s.dy_right > low ? s.dy_right : low;
-    at_right = at_right < high ? at_right : high;
-    float at_left = -s.dy_right > low ? -s.dy_right : low;
-    at_left = at_left < high ? at_left : high;
-    const float square_right = s.root0 + s.root2 * at_right * at_right;
-    const float square_left = s.root0 + s.root2 * at_left * at_left;
-    const float safe_right = square_right > 0 ? square_right : 0;
-    const float safe_left = square_left > 0 ? square_left : 0;
-    float first = x + s.slope * at_left - std::sqrt(safe_left) - kSlack;
-    float last = x + s.slope * at_right + std::sqrt(safe_right) + kSlack;
-    // [first, last] in pixels to cells [begin, end); +3 rounds up to the next pixel centre's cell
-    first = first > 0 ? first : 0;
-    first = first < kTile ? first : kTile;
-    last = last > -1 ? last : -1;
-    last = last < kTile - 1 ? last : kTile - 1;
-    const int32_t floor_first = static_cast<int32_t>(first);
-    const int32_t first_pixel = floor_first + (static_cast<float>(floor_first) < first);
-    const int32_t begin = first_pixel >> 2;
-    const int32_t end = (static_cast<int32_t>(last + 4.0f) >> 2);
-    const bool meets = (square_right >= 0) | (square_left >= 0);
-    row_bits[row] = (meets & (end > begin)) ? (1 << end) - (1 << begin) : 0;
+    const F low = splat(static_cast<float>(row * kCell)) - v, high = low + splat(kCell - 1.0f);
+    const F right_y = smaller(larger(dy_right, low), high);
+    const F left_y = smaller(larger(-dy_right, low), high);
+    const F right_square = reach - curve * right_y * right_y;
+    const F left_square = reach - curve * left_y * left_y;
+    const M meets = at_least(larger(right_square, left_square), zero);
+    const F right =
+        u + slope * right_y + (widened * rough_root(larger(right_square, tiny)) + slack);
+    const F left =
+        u + slope * left_y - (widened * rough_root(larger(left_square, tiny)) + slack);
+    const F begin = smaller(larger((left + splat(1.0f)) * quarter, zero), eight);
+    const F end = smaller(larger((right + splat(4.0f)) * quarter, zero), eight);
+    // bits begin ... end - 1
+    const F run = larger(power_of_floor(end) - power_of_floor(begin), zero);
+    const I row_bits = to_int(keep(meets, run));
+    I& word = words[row / 4];
+    word = row % 4 ? or_shifted(word, row_bits, row % 4 * 8) : row_bits;
   }
-  uint64_t cells = 0;
-  for (int row = 0; row < 8; ++row) {
-    cells |= static_cast<uint64_t>(static_cast<uint32_t>(row_bits[row]) & 255u) << (8 * row);
+  store_int(batch->cells[0] + i, words[0]);
+  store_int(batch->cells[1] + i, words[1]);
+}
+
+// Fills batch->row, in order, with zeros behind; returns its size.
+inline int list_row(Batch* batch, int count, int row) {
+  int size = 0;
+  for (int i = 0; i < count; i += W) {
+    const I columns = byte_of(load_int(batch->cells[row / 4] + i), row % 4);
+    const I numbered = or_shifted(counting_from(i), columns, 16);
+    size = append(any_bit(columns), numbered, batch->row, size);
   }
-  return cells;
+  for (int i = 0; i < W; ++i) batch->row[size + i] = 0;
+  return size;
+}
+
+// Fills batch->list, in order, with the invisible Gaussian behind; returns its size.
+inline int list_cell(Batch* batch, int row_size, int column) {
+  int size = 0;
+  for (int i = 0; i < row_size; i += W) {
+    const I numbered = load_int(batch->row + i);
+    size = append(has_bit(numbered, 16 + column), low_half(numbered), batch->list, size);
+  }
+  for (int i = 0; i < kTogether; ++i) batch->list[size + i] = kBatch;
+  return size;
 }
 
 // Planes of one cell in the tile's frame buffer, each of 16 pixels.
@@ -259,49 +300,117 @@ struct alignas(64) TileBuffer {
   float cell[kCells][kPlanes][kPixels];
 };
 
-// Offsets of the pixels of a cell, and of the cells of a tile.
 struct alignas(64) Offsets {
-  float pixel_x[kPixels], pixel_y[kPixels];
+  float x[kPixels], y[kPixels];
 };
-const Offsets kOffsets = {{0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3},
-                          {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3}};
+const Offsets kPixelOffsets = {{0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3},
+                               {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3}};
 
-// One Gaussian over W pixels of one cell.
+// W pixels while Gaussians are blended into them.
 template <bool kExtra>
-inline void blend_lanes(const Splat& s, F dx, F dy, float* cell) {
-  const F q = dx * (splat(s.a) * dx + splat(s.b) * dy) +
-              (splat(s.c) * dy * dy + splat(s.log_opacity));
-  const M counts = at_least(q, splat(kLog2AlphaMin));
-  const F alpha = smaller(exp2_near(q), splat(kAlphaMax));
-  const F before = load(cell + kT * kPixels);
-  F weight = keep(counts, alpha * before);
-  const F after = before - weight;
-  store(cell + kT * kPixels, after);
-  // the Gaussian that would push the transmittance under kStop is dropped, and so is all behind
-  // it: after never grows again
-  weight = keep(at_least(after, splat(kStop)), weight);
-  const auto add = [&](int plane, F x) {
-    float* p = cell + plane * kPixels;
-    store(p, load(p) + x);
-  };
-  add(kAlpha, weight);
-  add(kRed, weight * splat(s.red));
-  add(kGreen, weight * splat(s.green));
-  add(kBlue, weight * splat(s.blue));
-  add(kDepth, weight * splat(s.z));
-  if (kExtra) {
-    const F half = splat(0.5f), alpha_sum = load(cell + kAlpha * kPixels);
-    const M crossed = both(at_least(alpha_sum, half), above(half, alpha_sum - weight));
-    float* p = cell + kMedian * kPixels;
-    store(p, pick(crossed, splat(s.z), load(p)));
-    p = cell + kWeight * kPixels;
-    const M heavier = above(weight, load(p));
-    store(p, pick(heavier, weight, load(p)));
-    p = cell + kId * kPixels;
+struct Accumulator {
+  F x, y;  // pixel centres
+  F t, alpha, red, green, blue, depth;
+  F median, heaviest, id;
+
+  inline void read(const float* p) {
+    t = load(p + kT * kPixels);
+    alpha = load(p + kAlpha * kPixels);
+    red = load(p + kRed * kPixels);
+    green = load(p + kGreen * kPixels);
+    blue = load(p + kBlue * kPixels);
+    depth = load(p + kDepth * kPixels);
+    if (!kExtra) return;
+    median = load(p + kMedian * kPixels);
+    heaviest = load(p + kWeight * kPixels);
+    id = load(p + kId * kPixels);
+  }
+
+  inline void write(float* p) const {
+    store(p + kT * kPixels, t);
+    store(p + kAlpha * kPixels, alpha);
+    store(p + kRed * kPixels, red);
+    store(p + kGreen * kPixels, green);
+    store(p + kBlue * kPixels, blue);
+    store(p + kDepth * kPixels, depth);
+    if (!kExtra) return;
+    store(p + kMedian * kPixels, median);
+    store(p + kWeight * kPixels, heaviest);
+    store(p + kId * kPixels, id);
+  }
+
+  // alphas of kAbreast Gaussians, step by step: each step waits for the one before
+  inline void alphas(const Splat* splats, const uint32_t* list, F* a) const {
+    const Splat* s[kAbreast];
+    F dx[kAbreast], dy[kAbreast], p[kAbreast], q[kAbreast];
+    M counts[kAbreast];
+    for (int i = 0; i < kAbreast; ++i) s[i] = splats + list[i];
+    for (int i = 0; i < kAbreast; ++i) dx[i] = x - splat(s[i]->u);
+    for (int i = 0; i < kAbreast; ++i) dy[i] = y - splat(s[i]->v);
+    for (int i = 0; i < kAbreast; ++i) q[i] = splat(s[i]->across) * dy[i];
+    for (int i = 0; i < kAbreast; ++i) p[i] = splat(s[i]->shear) * dy[i];
+    for (int i = 0; i < kAbreast; ++i) p[i] = splat(s[i]->along) * dx[i] + p[i];
+    for (int i = 0; i < kAbreast; ++i) {
+      a[i] = minus_product(splat(s[i]->log_opacity), q[i], q[i]);
+    }
+    for (int i = 0; i < kAbreast; ++i) a[i] = minus_product(a[i], p[i], p[i]);
+    for (int i = 0; i < kAbreast; ++i) counts[i] = at_least(a[i], splat(kLog2AlphaMin));
+    exp2_near<kAbreast>(a);
+    for (int i = 0; i < kAbreast; ++i) a[i] = keep(counts[i], smaller(a[i], splat(kAlphaMax)));
+  }
+
+  // kTogether Gaussians, front to back
+  inline void add(const Splat* splats, const uint32_t* list) {
+    F a[kTogether], weight[kTogether];
+    for (int i = 0; i < kTogether; i += kAbreast) alphas(splats, list + i, a + i);
+    for (int i = 0; i < kTogether; ++i) {
+      const F before = t;
+      t = minus_product(before, a[i], before);
+      // the Gaussian that would push the transmittance under kStop is dropped, and so is all
+      // behind it, as t never grows again
+      weight[i] = keep(at_least(t, splat(kStop)), a[i] * before);
+    }
+    for (int i = 0; i < kTogether; ++i) {
+      const Splat& s = splats[list[i]];
+      alpha = alpha + weight[i];
+      red = red + weight[i] * splat(s.red);
+      green = green + weight[i] * splat(s.green);
+      blue = blue + weight[i] * splat(s.blue);
+      depth = depth + weight[i] * splat(s.z);
+      if (kExtra) add_extra(s, weight[i]);
+    }
+  }
+
+  inline void add_extra(const Splat& s, F weight) {
+    const F half = splat(0.5f);
+    const M crossed = both(at_least(alpha, half), above(half, alpha - weight));
+    median = pick(crossed, splat(s.z), median);
+    const M heavier = above(weight, heaviest);
+    heaviest = pick(heavier, weight, heaviest);
     float index;
     std::memcpy(&index, &s.index, 4);
-    store(p, pick(heavier, splat(index), load(p)));
+    id = pick(heavier, splat(index), id);
   }
+};
+
+// The batch's list over one cell. False where every pixel of the cell is finished.
+template <bool kExtra>
+inline bool blend_cell(const Batch& batch, int size, float cell_u, float cell_v, float* pixels) {
+  unsigned unfinished = 0;
+  for (int l = 0; l < kPixels; l += W) {
+    Accumulator<kExtra> sum;
+    sum.x = splat(cell_u) + load(kPixelOffsets.x + l);
+    sum.y = splat(cell_v) + load(kPixelOffsets.y + l);
+    sum.read(pixels + l);
+    unsigned open = bits(at_least(sum.t, splat(kStop)));
+    for (int i = 0; i < size && open; i += kTogether) {
+      sum.add(batch.splats, batch.list + i);
+      open = bits(at_least(sum.t, splat(kStop)));
+    }
+    sum.write(pixels + l);
+    unfinished |= open;
+  }
+  return unfinished != 0;
 }
 
 // Bits of the cells that have pixels inside the image.
@@ -313,49 +422,37 @@ inline uint64_t cells_inside(int width, int height) {
   return cells;
 }
 
-// Bits of the cells, among those given, where some pixel is not finished.
-inline uint64_t unfinished(const TileBuffer& buffer, uint64_t cells) {
-  uint64_t live = 0;
-  for (uint64_t m = cells; m; m &= m - 1) {
-    const int cell = __builtin_ctzll(m);
-    unsigned any = 0;
-    for (int l = 0; l < kPixels; l += W) {
-      any |= bits(at_least(load(&buffer.cell[cell][kT][l]), splat(kStop)));
-    }
-    live |= static_cast<uint64_t>(any != 0) << cell;
-  }
-  return live;
-}
-
 template <bool kExtra>
 int64_t blend_keys(const Splat* splats, const uint64_t* keys, int64_t n, float tile_u,
-                   float tile_v, uint64_t live, TileBuffer* buffer) {
-  constexpr int kBatch = 32;
-  uint64_t cells[kBatch];
+                   float tile_v, uint64_t live, Batch* batch, TileBuffer* buffer) {
+  constexpr int kAhead = 48;
   int64_t evaluated = 0;
   for (int64_t start = 0; start < n && live; start += kBatch) {
     const int size = static_cast<int>(n - start < kBatch ? n - start : kBatch);
+    const int padded = (size + 15) / 16 * 16;
     for (int i = 0; i < size; ++i) {
-      if (start + i + 16 < n) {
-        __builtin_prefetch(&splats[static_cast<uint32_t>(keys[start + i + 16])]);
+      if (start + i + kAhead < n) {
+        __builtin_prefetch(&splats[static_cast<uint32_t>(keys[start + i + kAhead])]);
       }
-      const Splat& s = splats[static_cast<uint32_t>(keys[start + i])];
-      cells[i] = cells_touched(s, s.u - tile_u, s.v - tile_v) & live;
+      batch->splats[i] = splats[static_cast<uint32_t>(keys[start + i])];
     }
-    for (int i = 0; i < size; ++i) {
-      const Splat& s = splats[static_cast<uint32_t>(keys[start + i])];
-      const float u = tile_u - s.u, v = tile_v - s.v;
-      evaluated += __builtin_popcountll(cells[i]);
-      for (uint64_t m = cells[i]; m; m &= m - 1) {
-        const int cell = __builtin_ctzll(m);
-        const F x = splat(u + kCell * (cell & 7)), y = splat(v + kCell * (cell >> 3));
-        for (int l = 0; l < kPixels; l += W) {
-          blend_lanes<kExtra>(s, x + load(kOffsets.pixel_x + l), y + load(kOffsets.pixel_y + l),
-                              &buffer->cell[cell][0][l]);
+    for (int i = size; i < padded; ++i) batch->splats[i] = batch->splats[kBatch];
+    for (int i = 0; i < padded; i += W) cells_touched(batch, i, tile_u, tile_v);
+    for (int row = 0; row < 8; ++row) {
+      unsigned columns = static_cast<unsigned>(live >> (8 * row)) & 255u;
+      const int row_size = columns ? list_row(batch, padded, row) : 0;
+      if (row_size == 0) continue;
+      for (; columns; columns &= columns - 1) {
+        const int column = __builtin_ctz(columns), cell = 8 * row + column;
+        const int count = list_cell(batch, row_size, column);
+        evaluated += count;
+        if (count == 0) continue;
+        const float cell_u = tile_u + kCell * column, cell_v = tile_v + kCell * row;
+        if (!blend_cell<kExtra>(*batch, count, cell_u, cell_v, buffer->cell[cell][0])) {
+          live &= ~(1ull << cell);
         }
       }
     }
-    live = unfinished(*buffer, live);
   }
   return evaluated;
 }
@@ -371,26 +468,59 @@ void clear(TileBuffer* buffer, bool extra) {
   }
 }
 
-void write_pixels(const View& view, const TileBuffer& buffer, int x0, int y0,
+// Background added and depth divided, in place.
+inline void finish_cell(float* cell, const Images& images) {
+  const F one = splat(1.0f), zero = splat(0.0f);
+  for (int l = 0; l < kPixels; l += W) {
+    const F alpha = load(cell + kAlpha * kPixels + l);
+    for (int k = 0; k < 3; ++k) {
+      float* p = cell + (kRed + k) * kPixels + l;
+      store(p, load(p) + (one - alpha) * splat(images.background[k]));
+    }
+    float* depth = cell + kDepth * kPixels + l;
+    const M drawn = above(alpha, zero);
+    store(depth, keep(drawn, load(depth) / pick(drawn, alpha, one)));
+  }
+}
+
+// Pixels [0, count) of one row of a cell.
+inline void write_row(const float* cell, size_t at, int count, const Images& images) {
+  if (images.rgb) {
+    float* rgb = images.rgb + at * 3;
+    const float* red = cell + kRed * kPixels;
+    float mixed[3 * kCell];
+    for (int x = 0; x < kCell; ++x) {
+      for (int k = 0; k < 3; ++k) mixed[3 * x + k] = red[k * kPixels + x];
+    }
+    std::memcpy(rgb, mixed, count * 3 * sizeof(float));
+  }
+  const auto copy = [&](void* image, int plane) {
+    if (image) {
+      std::memcpy(static_cast<float*>(image) + at, cell + plane * kPixels, count * sizeof(float));
+    }
+  };
+  copy(images.depth, kDepth);
+  copy(images.alpha, kAlpha);
+  copy(images.median_depth, kMedian);
+  copy(images.ids, kId);
+}
+
+void write_pixels(const View& view, TileBuffer* buffer, int x0, int y0, uint64_t inside,
                   const Images& images) {
+  for (uint64_t m = inside; m; m &= m - 1) {
+    finish_cell(buffer->cell[__builtin_ctzll(m)][0], images);
+  }
   const int width = view.width - x0 < kTile ? view.width - x0 : kTile;
   const int height = view.height - y0 < kTile ? view.height - y0 : kTile;
   for (int y = 0; y < height; ++y) {
     const size_t row = static_cast<size_t>(y0 + y) * view.width + x0;
-    for (int x = 0; x < width; ++x) {
-      const auto& cell = buffer.cell[(y / kCell) * 8 + x / kCell];
-      const int l = (y % kCell) * kCell + x % kCell;
-      const float alpha = cell[kAlpha][l];
-      if (images.rgb) {
-        float* rgb = images.rgb + (row + x) * 3;
-        rgb[0] = cell[kRed][l] + (1 - alpha) * images.background[0];
-        rgb[1] = cell[kGreen][l] + (1 - alpha) * images.background[1];
-        rgb[2] = cell[kBlue][l] + (1 - alpha) * images.background[2];
+    for (int x = 0; x < width; x += kCell) {
+      const float* cell = buffer->cell[y / kCell * 8 + x / kCell][0] + y % kCell * kCell;
+      if (width - x >= kCell) {
+        write_row(cell, row + x, kCell, images);
+      } else {
+        write_row(cell, row + x, width - x, images);
       }
-      if (images.depth) images.depth[row + x] = alpha > 0 ? cell[kDepth][l] / alpha : 0;
-      if (images.alpha) images.alpha[row + x] = alpha;
-      if (images.median_depth) images.median_depth[row + x] = cell[kMedian][l];
-      if (images.ids) std::memcpy(&images.ids[row + x], &cell[kId][l], 4);
     }
   }
 }
@@ -398,14 +528,17 @@ void write_pixels(const View& view, const TileBuffer& buffer, int x0, int y0,
 int64_t blend(const View& view, const Splat* splats, const uint64_t* keys, int64_t n, int tile_x,
               int tile_y, const Images& images) {
   TileBuffer buffer;
+  Batch batch;
+  batch.splats[kBatch] = Splat{};
+  batch.splats[kBatch].log_opacity = -100.0f;
   const int x0 = tile_x * kTile, y0 = tile_y * kTile;
   const bool extra = images.median_depth || images.ids;
   clear(&buffer, extra);
-  const uint64_t live = cells_inside(view.width - x0, view.height - y0);
-  const float u = static_cast<float>(x0), v = static_cast<float>(y0);
-  const int64_t evaluated = extra ? blend_keys<true>(splats, keys, n, u, v, live, &buffer)
-                                  : blend_keys<false>(splats, keys, n, u, v, live, &buffer);
-  write_pixels(view, buffer, x0, y0, images);
+  const uint64_t inside = cells_inside(view.width - x0, view.height - y0);
+  const auto blend_all = extra ? blend_keys<true> : blend_keys<false>;
+  const int64_t evaluated = blend_all(splats, keys, n, static_cast<float>(x0),
+                                      static_cast<float>(y0), inside, &batch, &buffer);
+  write_pixels(view, &buffer, x0, y0, inside, images);
   return evaluated;
 }
 

@@ -15,8 +15,8 @@ constexpr float kHalfMax = 65504.0f;
 
 template <class T>
 T* allocate(size_t count) {
-  const size_t bytes = (count * sizeof(T) + 63) / 64 * 64;
-  void* p = std::aligned_alloc(64, bytes ? bytes : 64);
+  const size_t bytes = count * sizeof(T);
+  void* p = allocate_bytes(bytes);
   if (!p) throw std::bad_alloc();
   std::memset(p, 0, bytes);
   return static_cast<T*>(p);

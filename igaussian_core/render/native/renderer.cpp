@@ -33,7 +33,7 @@ class Buffer {
       std::free(data_);
       capacity_ = 0;
       const size_t wanted = count + count / 4;
-      data_ = static_cast<T*>(std::aligned_alloc(64, (wanted * sizeof(T) + 63) / 64 * 64));
+      data_ = static_cast<T*>(allocate_bytes(wanted * sizeof(T)));
       if (!data_) throw std::bad_alloc();
       capacity_ = wanted;
     }
@@ -137,20 +137,15 @@ void cull(const Model& model, const View& view, std::vector<int32_t>* seen) {
   }
 }
 
-// One stable pass by 8 bits of (depth - least) >> shift.
-void radix_pass(const uint64_t* from, uint64_t* to, size_t n, uint32_t least, int shift) {
-  uint32_t starts[256] = {};
-  const auto digit = [&](uint64_t key) {
-    return ((static_cast<uint32_t>(key >> 32) - least) >> shift) & 255u;
-  };
-  for (size_t i = 0; i < n; ++i) ++starts[digit(from[i])];
+uint32_t depth_bits(uint64_t key) { return static_cast<uint32_t>(key >> 32); }
+
+void counts_to_starts(uint32_t* counts) {
   uint32_t sum = 0;
-  for (uint32_t& start : starts) {
-    const uint32_t count = start;
-    start = sum;
+  for (int i = 0; i < 256; ++i) {
+    const uint32_t count = counts[i];
+    counts[i] = sum;
     sum += count;
   }
-  for (size_t i = 0; i < n; ++i) to[starts[digit(from[i])]++] = from[i];
 }
 
 // Nearly sorted keys; gives up after too many moves.
@@ -176,14 +171,22 @@ void sort_keys(uint64_t* keys, uint64_t* spare, size_t n) {
   }
   uint32_t least = ~0u, most = 0;
   for (size_t i = 0; i < n; ++i) {
-    const uint32_t depth = static_cast<uint32_t>(keys[i] >> 32);
-    least = std::min(least, depth);
-    most = std::max(most, depth);
+    least = std::min(least, depth_bits(keys[i]));
+    most = std::max(most, depth_bits(keys[i]));
   }
   int shift = 0;
   while ((most - least) >> shift >> 16) ++shift;
-  radix_pass(keys, spare, n, least, shift);
-  radix_pass(spare, keys, n, least, shift + 8);
+  const auto digits = [&](uint64_t key) { return (depth_bits(key) - least) >> shift; };
+  uint32_t low[256] = {}, high[256] = {};
+  for (size_t i = 0; i < n; ++i) {
+    const uint32_t d = digits(keys[i]);
+    ++low[d & 255];
+    ++high[d >> 8];
+  }
+  counts_to_starts(low);
+  counts_to_starts(high);
+  for (size_t i = 0; i < n; ++i) spare[low[digits(keys[i]) & 255]++] = keys[i];
+  for (size_t i = 0; i < n; ++i) keys[high[digits(spare[i]) >> 8]++] = spare[i];
   if (!insertion_sort(keys, n)) std::sort(keys, keys + n);
 }
 
@@ -271,7 +274,11 @@ void Renderer::blend(int thread, const View& view, const Images& images) {
     size_t filled = 0;
     for (const auto& other : workers_) {
       for (const Chunk* c = other->tiles[tile].head; c; c = c->next) {
-        std::memcpy(keys + filled, c->keys, c->size * sizeof(uint64_t));
+        if (c->next) __builtin_prefetch(c->next->keys + Chunk::kKeys);
+        for (int64_t i = 0; i < c->size; ++i) {
+          keys[filled + i] = c->keys[i];
+          __builtin_prefetch(&splats_.data()[static_cast<uint32_t>(c->keys[i])]);
+        }
         filled += c->size;
       }
     }

@@ -8,7 +8,24 @@
 #include <cstdint>
 #include <cstdlib>
 
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
 namespace igaussian {
+
+// At least `bytes` of 64-byte aligned memory for free(); null when there is none. Large pages
+// where the system has them: frames read tens of megabytes in no regular order.
+static inline void* allocate_bytes(size_t bytes) {
+  constexpr size_t kLarge = size_t(1) << 21;
+  const size_t alignment = bytes >= 2 * kLarge ? kLarge : 64;
+  bytes = (bytes + alignment - 1) / alignment * alignment;
+  void* p = std::aligned_alloc(alignment, bytes ? bytes : alignment);
+#if defined(__linux__)
+  if (p && alignment == kLarge) madvise(p, bytes, MADV_HUGEPAGE);
+#endif
+  return p;
+}
 
 constexpr int kBlock = 16;        // Gaussians stored side by side (structure of arrays)
 constexpr int kSuperBlock = 256;  // Gaussians culled by one frustum test
@@ -53,16 +70,17 @@ struct View {
   float x_limit[2], y_limit[2];  // clamp of x/z and y/z in the Jacobian
 };
 
-// A projected Gaussian, one cache line. log2(alpha) at offset (dx, dy) from (u, v) is
-// a dx^2 + b dx dy + c dy^2 + log_opacity.
+// A projected Gaussian, one cache line. At (dx, dy) pixels from (u, v)
+//   log2(alpha) = log_opacity - (along * dx + shear * dy)^2 - (across * dy)^2,
+// the Cholesky form of the inverse covariance: a sum of squares, which does not cancel.
 struct alignas(64) Splat {
-  float u, v, a, b, c, log_opacity;
+  float u, v, along, shear, across, log_opacity;
   float red, green, blue, z;
-  // the ellipse alpha = 1/255 spans slope * dy +- sqrt(root0 + root2 dy^2) at height dy,
-  // and is widest at dy = +-dy_right
-  float slope, root0, root2, dy_right;
-  int32_t index;
-  float unused;
+  // the ellipse alpha = 1/255, at height dy over (u, v), is centred on slope * dy and reaches
+  // farthest right at dy_right; inv_along = 1 / along
+  float slope, dy_right, inv_along;
+  int32_t index;  // in the caller's arrays
+  float unused[2];
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
 
@@ -95,7 +113,7 @@ static inline Chunk* take_chunk(Arena* arena) {
   if (arena->current == nullptr || arena->used == Slab::kChunks) {
     Slab** link = arena->current ? &arena->current->next : &arena->first;
     if (*link == nullptr) {
-      *link = static_cast<Slab*>(std::aligned_alloc(64, sizeof(Slab)));
+      *link = static_cast<Slab*>(allocate_bytes(sizeof(Slab)));
       if (*link == nullptr) return nullptr;
       (*link)->next = nullptr;
     }

@@ -17,6 +17,9 @@ namespace {
 
 constexpr int W = 16;
 constexpr bool kHalfSh = true;
+// Gaussians whose alphas are computed side by side, and those blended between two looks at
+// whether the pixels are finished: what the registers hold
+constexpr int kAbreast = 4, kTogether = 4;
 using F = __m512;
 using M = __mmask16;
 
@@ -38,17 +41,77 @@ inline F pick(M m, F yes, F no) { return _mm512_mask_mov_ps(no, m, yes); }
 inline void store_int(int32_t* p, F x) { _mm512_storeu_si512(p, _mm512_cvttps_epi32(x)); }
 inline F exponent_of(F x) { return _mm512_getexp_ps(x); }               // floor(log2 x), x > 0
 inline F mantissa_of(F x) { return _mm512_getmant_ps(x, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_src); }
-// 2^floor(q) * p
-inline F scale_by_floor(F p, F q) { return _mm512_scalef_ps(p, q); }
-inline F fraction(F q) { return _mm512_reduce_ps(q, 0x09); }            // q - floor(q)
+// c - a * b, rounded once: GCC would share the product with another use of it
+inline F minus_product(F c, F a, F b) { return _mm512_fnmadd_ps(a, b, c); }
+// sqrt(x), x > 0, relative error 1.3e-4
+inline F rough_root(F x) { return x * _mm512_rsqrt14_ps(x); }
+inline F power_of_floor(F x) { return _mm512_scalef_ps(splat(1.0f), x); }  // 2^floor(x)
+
+using I = __m512i;
+inline I to_int(F x) { return _mm512_cvttps_epi32(x); }
+inline I or_shifted(I a, I b, int shift) { return _mm512_or_si512(a, _mm512_slli_epi32(b, shift)); }
+inline void store_int(uint32_t* p, I x) { _mm512_store_si512(p, x); }
+
+inline I load_int(const uint32_t* p) { return _mm512_load_si512(p); }
+inline I byte_of(I words, int number) {
+  return _mm512_and_si512(_mm512_srli_epi32(words, 8 * number), _mm512_set1_epi32(255));
+}
+inline M any_bit(I x) { return _mm512_test_epi32_mask(x, x); }
+inline M has_bit(I x, int bit) { return _mm512_test_epi32_mask(x, _mm512_set1_epi32(1u << bit)); }
+inline I counting_from(int first) {
+  const I iota = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+  return _mm512_add_epi32(iota, _mm512_set1_epi32(first));
+}
+inline I low_half(I x) { return _mm512_and_si512(x, _mm512_set1_epi32(0xffff)); }
+// Appends the lanes of x that are in m; writes up to W values past the new end.
+inline int append(M m, I x, uint32_t* list, int size) {
+  _mm512_storeu_si512(list + size, _mm512_maskz_compress_epi32(m, x));
+  return size + __builtin_popcount(m);
+}
+
+// 16 fields of W Gaussians each, to W lines of 16 floats.
+inline void to_lines(const F* rows, float* lines) {
+  F a[16], b[16];
+  for (int i = 0; i < 16; i += 2) {
+    a[i] = _mm512_unpacklo_ps(rows[i], rows[i + 1]);
+    a[i + 1] = _mm512_unpackhi_ps(rows[i], rows[i + 1]);
+  }
+  for (int i = 0; i < 16; i += 4) {
+    b[i] = _mm512_shuffle_ps(a[i], a[i + 2], 0x44);
+    b[i + 1] = _mm512_shuffle_ps(a[i], a[i + 2], 0xee);
+    b[i + 2] = _mm512_shuffle_ps(a[i + 1], a[i + 3], 0x44);
+    b[i + 3] = _mm512_shuffle_ps(a[i + 1], a[i + 3], 0xee);
+  }
+  // b[4 * j + i]: quarter q holds fields 4j..4j+3 of line 4q + i
+  for (int i = 0; i < 4; ++i) {
+    const F x = _mm512_shuffle_f32x4(b[i], b[i + 4], 0x44);
+    const F y = _mm512_shuffle_f32x4(b[i], b[i + 4], 0xee);
+    const F z = _mm512_shuffle_f32x4(b[i + 8], b[i + 12], 0x44);
+    const F w = _mm512_shuffle_f32x4(b[i + 8], b[i + 12], 0xee);
+    store(lines + i * 16, _mm512_shuffle_f32x4(x, z, 0x88));
+    store(lines + (i + 4) * 16, _mm512_shuffle_f32x4(x, z, 0xdd));
+    store(lines + (i + 8) * 16, _mm512_shuffle_f32x4(y, w, 0x88));
+    store(lines + (i + 12) * 16, _mm512_shuffle_f32x4(y, w, 0xdd));
+  }
+}
+
+// The given fields of W lines of 16 floats.
+template <int kCount>
+inline void from_lines(const float* lines, const int (&fields)[kCount], F* rows) {
+  F in[16];
+  alignas(64) float out[16][16];
+  for (int i = 0; i < 16; ++i) in[i] = load(lines + i * 16);
+  to_lines(in, out[0]);
+  for (int k = 0; k < kCount; ++k) rows[k] = load(out[fields[k]]);
+}
 
 #else
 
 #if defined(__AVX2__)
 constexpr int W = 8;
 constexpr bool kHalfSh = true;
+constexpr int kAbreast = 2, kTogether = 8;
 using F = __m256;
-using I = __m256i;
 using I32 = int32_t __attribute__((vector_size(32)));
 
 inline F splat(float x) { return _mm256_set1_ps(x); }
@@ -60,9 +123,12 @@ inline F load_half(const uint16_t* p) {
 inline F smaller(F a, F b) { return _mm256_min_ps(a, b); }
 inline F larger(F a, F b) { return _mm256_max_ps(a, b); }
 inline F root(F x) { return _mm256_sqrt_ps(x); }
+inline F minus_product(F c, F a, F b) { return _mm256_fnmadd_ps(a, b, c); }
+inline F rough_root(F x) { return x * _mm256_rsqrt_ps(x); }  // relative error 4e-4
 #else
 constexpr int W = 4;
 constexpr bool kHalfSh = false;
+constexpr int kAbreast = 2, kTogether = 8;
 using F = float __attribute__((vector_size(16)));
 using I32 = int32_t __attribute__((vector_size(16)));
 
@@ -76,6 +142,12 @@ inline F root(F x) {
   return F{__builtin_sqrtf(x[0]), __builtin_sqrtf(x[1]), __builtin_sqrtf(x[2]),
            __builtin_sqrtf(x[3])};
 }
+inline F minus_product(F c, F a, F b) { return c - a * b; }
+#if defined(__SSE2__)
+inline F rough_root(F x) { return x * _mm_rsqrt_ps(x); }
+#else
+inline F rough_root(F x) { return root(x); }
+#endif
 #endif
 
 using M = I32;  // all bits of a lane set, or none
@@ -90,7 +162,7 @@ inline unsigned bits(M m) {
 #elif defined(__SSE2__)
   return static_cast<unsigned>(_mm_movemask_ps((F)m));
 #else
-  const I32 b = m & I32{1, 2, 4, 8};
+  const I32 b = (m >> 31) & I32{1, 2, 4, 8};
   return static_cast<unsigned>(b[0] | b[1] | b[2] | b[3]);
 #endif
 }
@@ -100,29 +172,100 @@ inline void store_int(int32_t* p, F x) {
 }
 inline F exponent_of(F x) { return __builtin_convertvector(((I32)x >> 23) - 127, F); }
 inline F mantissa_of(F x) { return (F)(((I32)x & 0x007fffff) | 0x3f800000); }
+inline F power_of_floor(F x) {  // 2^floor(x), 0 <= x < 127
+  return (F)((__builtin_convertvector(x, I32) + 127) << 23);
+}
+
+using I = I32;
+inline I to_int(F x) { return __builtin_convertvector(x, I); }
+inline I or_shifted(I a, I b, int shift) { return a | (b << shift); }
+inline void store_int(uint32_t* p, I x) { *reinterpret_cast<I*>(p) = x; }
+
+inline I load_int(const uint32_t* p) { return *reinterpret_cast<const I*>(p); }
+inline I byte_of(I words, int number) { return (words >> (8 * number)) & 255; }
+inline M any_bit(I x) { return (M)(x != 0); }
+inline M has_bit(I x, int bit) { return x << (31 - bit); }  // only the sign counts
+inline I counting_from(int first) {
+  I x;
+  for (int l = 0; l < W; ++l) x[l] = first + l;
+  return x;
+}
+inline I low_half(I x) { return x & 0xffff; }
+
+#if defined(__AVX2__)
+// Numbers of the lanes set in each possible mask, first lanes first.
+struct LaneTable {
+  uint8_t lanes[1 << W][W];
+  constexpr LaneTable() : lanes() {
+    for (int mask = 0; mask < 1 << W; ++mask) {
+      int size = 0;
+      for (int lane = 0; lane < W; ++lane) {
+        if (mask >> lane & 1) lanes[mask][size++] = static_cast<uint8_t>(lane);
+      }
+    }
+  }
+};
+constexpr LaneTable kLaneTable;
+
+inline int append(M m, I x, uint32_t* list, int size) {
+  const unsigned set = bits(m);
+  const __m256i lanes = _mm256_cvtepu8_epi32(
+      _mm_loadl_epi64(reinterpret_cast<const __m128i*>(kLaneTable.lanes[set])));
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(list + size),
+                      _mm256_permutevar8x32_epi32((__m256i)x, lanes));
+  return size + __builtin_popcount(set);
+}
+#else
+inline int append(M m, I x, uint32_t* list, int size) {
+  for (int l = 0; l < W; ++l) {  // no branch: it could not be foreseen
+    list[size] = static_cast<uint32_t>(x[l]);
+    size += static_cast<int>(static_cast<uint32_t>(m[l]) >> 31);
+  }
+  return size;
+}
+#endif
+
+inline void to_lines(const F* rows, float* lines) {
+  for (int k = 0; k < 16; ++k) {
+    for (int l = 0; l < W; ++l) lines[l * 16 + k] = rows[k][l];
+  }
+}
+template <int kCount>
+inline void from_lines(const float* lines, const int (&fields)[kCount], F* rows) {
+  for (int k = 0; k < kCount; ++k) {
+    for (int l = 0; l < W; ++l) rows[k][l] = lines[l * 16 + fields[k]];
+  }
+}
 
 #endif
 
-// 2^q for q in [-126, 126], relative error 2.6e-6; garbage outside, NaN for NaN.
-// Coefficients: minimax of the relative error, degree 4.
-inline F exp2_near(F q) {
+// q[i] = 2^q[i] for q in [-126, 126], relative error 2.6e-6; garbage outside, NaN for NaN.
+// Coefficients: minimax of the relative error, degree 4. The loops go over independent values
+// because each step waits for the one before.
+template <int N>
+inline void exp2_near(F* q) {
+  F r[N], p[N];
 #if defined(__AVX512F__)
-  const F r = fraction(q);
-  F p = r * splat(1.35341673e-2f) + splat(5.20114637e-2f);
-  p = p * r + splat(2.41442761e-1f);
-  p = p * r + splat(6.93003834e-1f);
-  p = p * r + splat(1.00000259f);
-  return scale_by_floor(p, q);
+  for (int i = 0; i < N; ++i) r[i] = _mm512_reduce_ps(q[i], 0x09);  // q - floor(q)
+  constexpr float c[5] = {1.00000259f, 6.93003834e-1f, 2.41442761e-1f, 5.20114637e-2f,
+                          1.35341673e-2f};
 #else
   // adding 1.5 * 2^23 rounds to an integer that is left in the low bits
   const F magic = splat(12582912.0f);
-  const F shifted = q + magic;
-  const F r = q - (shifted - magic);
-  F p = r * splat(9.57010300e-3f) + splat(5.59178600e-2f);
-  p = p * r + splat(2.40247450e-1f);
-  p = p * r + splat(6.93121810e-1f);
-  p = p * r + splat(9.99999260e-1f);
-  return (F)((I32)p + ((I32)shifted << 23));
+  F shifted[N];
+  for (int i = 0; i < N; ++i) shifted[i] = q[i] + magic;
+  for (int i = 0; i < N; ++i) r[i] = q[i] - (shifted[i] - magic);
+  constexpr float c[5] = {9.99999260e-1f, 6.93121810e-1f, 2.40247450e-1f, 5.59178600e-2f,
+                          9.57010300e-3f};
+#endif
+  for (int i = 0; i < N; ++i) p[i] = r[i] * splat(c[4]) + splat(c[3]);
+  for (int i = 0; i < N; ++i) p[i] = p[i] * r[i] + splat(c[2]);
+  for (int i = 0; i < N; ++i) p[i] = p[i] * r[i] + splat(c[1]);
+  for (int i = 0; i < N; ++i) p[i] = p[i] * r[i] + splat(c[0]);
+#if defined(__AVX512F__)
+  for (int i = 0; i < N; ++i) q[i] = _mm512_scalef_ps(p[i], q[i]);
+#else
+  for (int i = 0; i < N; ++i) q[i] = (F)((I)p[i] + ((I)shifted[i] << 23));
 #endif
 }
 
