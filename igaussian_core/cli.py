@@ -7,7 +7,7 @@ import json
 import logging
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -29,10 +29,10 @@ console = Console()
 
 MapOption = Annotated[Path, typer.Option("--map", help="compiled map directory (.igmap)")]
 ConfigOption = Annotated[
-    Optional[Path], typer.Option("--config", help="JSON file of configuration groups")
+    Path | None, typer.Option("--config", help="JSON file of configuration groups")
 ]
 SetOption = Annotated[
-    Optional[list[str]], typer.Option("--set", help="one value, e.g. refine.rounds=2; repeatable")
+    list[str] | None, typer.Option("--set", help="one value, e.g. refine.rounds=2; repeatable")
 ]
 
 
@@ -117,14 +117,14 @@ def map_compile(
     source: Annotated[Path, typer.Argument(help="Gaussian map, .ply")],
     output: Annotated[Path, typer.Option("-o", "--output", help="compiled map directory")],
     cameras: Annotated[
-        Optional[Path],
+        Path | None,
         typer.Option(help="training cameras: poses.json, transforms.json, cameras.json, COLMAP"),
     ] = None,
-    kind: Annotated[Optional[str], typer.Option(help="object or scene")] = None,
+    kind: Annotated[str | None, typer.Option(help="object or scene")] = None,
     radius: Annotated[
-        Optional[float], typer.Option(help="radius of the spherical views, scene units")
+        float | None, typer.Option(help="radius of the spherical views, scene units")
     ] = None,
-    up: Annotated[Optional[str], typer.Option(help="up direction in the scene: x,y,z")] = None,
+    up: Annotated[str | None, typer.Option(help="up direction in the scene: x,y,z")] = None,
     views: Annotated[int, typer.Option(help="most source views", min=1, max=2000)] = 120,
     config: ConfigOption = None,
     set_: SetOption = None,
@@ -193,12 +193,12 @@ def _describe(path: Path) -> dict[str, str]:
 def map_align(
     path: Annotated[Path, typer.Argument(help="compiled map directory")],
     scale: Annotated[float, typer.Option(help="metres a scene unit")] = 1.0,
-    up: Annotated[Optional[str], typer.Option(help="the scene's up direction: x,y,z")] = None,
+    up: Annotated[str | None, typer.Option(help="the scene's up direction: x,y,z")] = None,
     origin: Annotated[
-        Optional[str], typer.Option(help="scene point that becomes the map's origin: x,y,z")
+        str | None, typer.Option(help="scene point that becomes the map's origin: x,y,z")
     ] = None,
     matrix: Annotated[
-        Optional[Path], typer.Option(help="JSON file with a 4x4 similarity T_map_scene")
+        Path | None, typer.Option(help="JSON file with a 4x4 similarity T_map_scene")
     ] = None,
 ) -> None:
     """Say where the map frame lies: metric scale, up axis, origin, or a whole similarity."""
@@ -225,7 +225,7 @@ def _folder_megabytes(path: Path) -> float:
     return sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) / 1e6
 
 
-FxOption = Annotated[Optional[float], typer.Option(help="focal length in pixels")]
+FxOption = Annotated[float | None, typer.Option(help="focal length in pixels")]
 
 
 @app.command()
@@ -237,7 +237,7 @@ def render(
     ],
     index: Annotated[int, typer.Option(help="which of the cameras")] = 0,
     depth: Annotated[
-        Optional[Path], typer.Option(help="write depth too: 16-bit PNG, thousandths of a unit")
+        Path | None, typer.Option(help="write depth too: 16-bit PNG, thousandths of a unit")
     ] = None,
 ) -> None:
     """Render a map at one of a file's cameras."""
@@ -272,12 +272,12 @@ def localize(
     map_path: MapOption,
     fx: Annotated[float, typer.Option(help="focal length in pixels")],
     fy: FxOption = None,
-    cx: Annotated[Optional[float], typer.Option(help="principal point, first pixel at 0")] = None,
-    cy: Annotated[Optional[float], typer.Option(help="principal point, first pixel at 0")] = None,
+    cx: Annotated[float | None, typer.Option(help="principal point, first pixel at 0")] = None,
+    cy: Annotated[float | None, typer.Option(help="principal point, first pixel at 0")] = None,
     model: Annotated[str, typer.Option(help="distortion model")] = "plumb_bob",
-    dist: Annotated[Optional[str], typer.Option(help="distortion coefficients, by commas")] = None,
+    dist: Annotated[str | None, typer.Option(help="distortion coefficients, by commas")] = None,
     prior: Annotated[
-        Optional[str], typer.Option(help="T_map_cam guess: x,y,z,qw,qx,qy,qz")
+        str | None, typer.Option(help="T_map_cam guess: x,y,z,qw,qx,qy,qz")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
     config: ConfigOption = None,
@@ -339,26 +339,26 @@ def _print_result(result: Any) -> None:
 @app.command()
 def demo(
     bag: Annotated[
-        Optional[Path], typer.Option(help="recording with true poses; default: the bundled drive")
+        Path | None, typer.Option(help="recording with true poses; default: the bundled drive")
     ] = None,
     map_path: Annotated[
-        Optional[Path], typer.Option("--map", help=".igmap or .ply; default: the bundled room")
+        Path | None, typer.Option("--map", help=".igmap or .ply; default: the bundled room")
     ] = None,
     cameras: Annotated[
-        Optional[Path], typer.Option(help="training cameras of the .ply, as for map compile")
+        Path | None, typer.Option(help="training cameras of the .ply, as for map compile")
     ] = None,
     work_dir: Annotated[
         Path, typer.Option(help="compiled map, report and recording go here")
     ] = Path("out"),
     rate: Annotated[float, typer.Option(help="replay rate; latencies hold at 1", min=0.01)] = 1.0,
     duration: Annotated[
-        Optional[float], typer.Option(help="seconds of the recording", min=0.1)
+        float | None, typer.Option(help="seconds of the recording", min=0.1)
     ] = None,
-    truth: Annotated[Optional[str], typer.Option(help="topic of the true camera poses")] = None,
+    truth: Annotated[str | None, typer.Option(help="topic of the true camera poses")] = None,
     no_ros: Annotated[
         bool, typer.Option("--no-ros", help="same worker and tracker inside this process")
     ] = False,
-    json_out: Annotated[Optional[Path], typer.Option("--json", help="write figures here")] = None,
+    json_out: Annotated[Path | None, typer.Option("--json", help="write figures here")] = None,
     config: ConfigOption = None,
     set_: SetOption = None,
 ) -> None:
@@ -381,7 +381,7 @@ def replay_bag(
     map_path: MapOption,
     rate: Annotated[float, typer.Option(help="2 plays twice as fast", min=0.01)] = 1.0,
     duration: Annotated[
-        Optional[float], typer.Option(help="seconds of the recording", min=0.1)
+        float | None, typer.Option(help="seconds of the recording", min=0.1)
     ] = None,
     every_frame: Annotated[
         bool, typer.Option(help="process every frame, however long it takes")
@@ -389,8 +389,8 @@ def replay_bag(
     recover: Annotated[
         bool, typer.Option(help="use what is readable of a truncated recording")
     ] = False,
-    image_topic: Annotated[Optional[str], typer.Option(help="default: found")] = None,
-    camera_info_topic: Annotated[Optional[str], typer.Option(help="default: found")] = None,
+    image_topic: Annotated[str | None, typer.Option(help="default: found")] = None,
+    camera_info_topic: Annotated[str | None, typer.Option(help="default: found")] = None,
     config: ConfigOption = None,
     set_: SetOption = None,
 ) -> None:
@@ -424,7 +424,7 @@ def eval_photos(
     poses: Annotated[Path, typer.Argument(help="photos with poses, as for map compile --cameras")],
     map_path: MapOption,
     note: Annotated[
-        Optional[Path], typer.Option(help="map.json that names the photos trained on")
+        Path | None, typer.Option(help="map.json that names the photos trained on")
     ] = None,
     allow_training: Annotated[
         bool, typer.Option(help="judge photos that the map was trained on, too")
@@ -434,7 +434,7 @@ def eval_photos(
     max_extent: Annotated[
         float, typer.Option(help="success: position error below, share of the cameras' extent")
     ] = 0.05,
-    json_out: Annotated[Optional[Path], typer.Option("--json", help="write results here")] = None,
+    json_out: Annotated[Path | None, typer.Option("--json", help="write results here")] = None,
     config: ConfigOption = None,
     set_: SetOption = None,
 ) -> None:
