@@ -42,7 +42,7 @@ from igaussian_ros import convert, diagnostics, overlay, parameters
 from igaussian_ros.camera_cache import CameraCache
 from igaussian_ros.pipeline import FramePipeline, ImageMessage, Outcome
 from igaussian_ros.tf import Frames, OdometryBuffer, create_tf_publisher, map_transform
-from igaussian_ros.throttle import Throttle
+from igaussian_ros.throttle import Throttle, key_of
 
 _SHUTDOWN_S = 4.0  # ros2 launch kills 5 s after SIGINT
 
@@ -81,7 +81,6 @@ class LocalizerNode(Node):
         self._loading = threading.Lock()
         self._begin = self._last_image = time.monotonic()
         self._last_submitted = -1e9
-        self._image_topic = self._resolved_image_topic()
         self._log_bridge = _bridge_logging(self)
 
         self._create_publishers()
@@ -94,7 +93,7 @@ class LocalizerNode(Node):
 
     # --- set-up ---
 
-    def _resolved_image_topic(self) -> str:
+    def _wanted_image_topic(self) -> str:
         topic = str(self._settings["image_topic"])
         if self._settings["image_transport"] == "compressed" and not topic.endswith("/compressed"):
             topic += "/compressed"
@@ -121,7 +120,7 @@ class LocalizerNode(Node):
         settings, qos = self._settings, self._input_qos(1)
         image_type = CompressedImage if settings["image_transport"] == "compressed" else Image
         self._image_subscription = self.create_subscription(
-            image_type, self._image_topic, self._on_image, qos
+            image_type, self._wanted_image_topic(), self._on_image, qos
         )
         self._info_subscription = self.create_subscription(
             CameraInfo, settings["camera_info_topic"], self._on_camera_info, qos
@@ -245,7 +244,7 @@ class LocalizerNode(Node):
             camera = self._cameras.update(message, frame)
         except CameraError as error:
             topic = self._info_subscription.topic_name
-            self._warn(f"camera_info:{str(error)[:40]}", f"{topic} is not used: {error}")
+            self._warn(f"camera_info:{key_of(str(error))}", f"{topic} is not used: {error}")
             return
         if not message.d and not self._settings["rectified"]:
             self._say_once_undistorted(camera)
@@ -472,7 +471,8 @@ class LocalizerNode(Node):
         if outcome.warning:
             self._warn(f"time:{outcome.warning[:20]}", outcome.warning)
         if outcome.name in ("rejected", "stale"):
-            self._warn(f"{outcome.name}:{outcome.key}", f"{self._image_topic}: {outcome.reason}")
+            topic = self._image_subscription.topic_name
+            self._warn(f"{outcome.name}:{outcome.key}", f"{topic}: {outcome.reason}")
         elif outcome.name == "lost":
             self._state = "lost"
             self._warn("lost", f"lost: {outcome.reason}; searching in the whole map")

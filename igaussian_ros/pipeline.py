@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import threading
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -18,6 +17,7 @@ from igaussian_core.tracker import Tracker
 from igaussian_ros.camera_cache import CameraCache
 from igaussian_ros.convert import image_from_ros, stamp_to_ns
 from igaussian_ros.parameters import Settings
+from igaussian_ros.throttle import key_of
 
 ImageMessage: TypeAlias = Image | CompressedImage
 
@@ -117,7 +117,7 @@ class FramePipeline:
             height, width = image.shape[:2]
             camera = self._cameras.find(width, height, self.camera_frame(message))
         except IGaussianError as error:
-            return Outcome("rejected", str(error), _key(error), age_ms=age_ms)
+            return Outcome("rejected", str(error), key_of(str(error)), age_ms=age_ms)
         warning = self._time_warning(stamp_ns, age_ms)
         self._apply_prior(stamp_ns)
         self._last_stamp_ns = stamp_ns
@@ -156,7 +156,3 @@ def _stale_text(age_ms: float, limit_s: float) -> str:
         text += "; a replayed bag needs use_sim_time:=true and a /clock"
     return text
 
-
-def _key(error: IGaussianError) -> str:
-    # equal mistakes share a key though their texts may carry changing numbers
-    return re.sub(r"\d+", "#", str(error))

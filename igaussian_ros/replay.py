@@ -64,7 +64,7 @@ class Options:
     raw: bool = False
     stamp_now: bool = False
     wait_s: float = 0.0
-    clock_hz: float = 100.0
+    clock_hz: float = 50.0
 
 
 @dataclass(frozen=True)
@@ -301,7 +301,7 @@ def parse(arguments: list[str] | None = None) -> tuple[str, Options]:
     parser.add_argument(
         "--wait-for-subscribers", type=float, default=0.0, metavar="S", help="at most so long"
     )
-    parser.add_argument("--clock-hz", type=_positive, default=100.0, help="rate of /clock")
+    parser.add_argument("--clock-hz", type=_positive, default=50.0, help="rate of /clock")
     a = parser.parse_args(arguments)
     return a.bag, Options(
         rate=a.rate,

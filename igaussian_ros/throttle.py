@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+
+
+_MOST_KEYS = 1000
+
+
+def key_of(text: str) -> str:
+    """The text without its numbers and hexadecimal bytes: equal mistakes have equal keys."""
+    return re.sub(r"\b[0-9a-f]{2}\b|\d+", "#", text)
 
 
 @dataclass
@@ -41,5 +50,7 @@ class Throttle:
                 seen.suppressed += 1
                 return
             suppressed = seen.suppressed if seen else 0
+            if len(self._seen) >= _MOST_KEYS:
+                self._seen.clear()
             self._seen[key] = _Seen(now)
         self._say(f"{text} ({suppressed} more of these since)" if suppressed else text)

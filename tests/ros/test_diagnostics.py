@@ -10,7 +10,7 @@ from scene import header
 
 from igaussian_core.result import LocalizationResult, Status
 from igaussian_ros import diagnostics
-from igaussian_ros.throttle import Throttle
+from igaussian_ros.throttle import Throttle, key_of
 
 
 def _values(array):
@@ -93,3 +93,9 @@ def test_a_throttle_says_the_first_and_counts_the_rest():
         throttle("a", f"a{i}")
     throttle("b", "b")
     assert said == ["a0", "a5 (4 more of these since)", "b"]
+
+
+def test_equal_mistakes_have_equal_keys():
+    a = key_of("jpeg: 120 bytes beginning with ff d8 00 1a are no image")
+    b = key_of("jpeg: 7 bytes beginning with 12 34 fe 9c are no image")
+    assert a == b != key_of("encoding '32FC1' is not supported")

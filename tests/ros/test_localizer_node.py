@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import signal
 import time
@@ -11,6 +12,7 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from harness import Spinning, call, node_process, replay_process, wait_until
 from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from scene import (
@@ -435,14 +437,20 @@ def test_a_signal_while_the_map_is_loading_ends_the_node(ros, corner, tmp_path):
 
 
 def test_silence_is_explained(ros, corner, tmp_path):
-    with node_process(
-        tmp_path, "image:=/x", map_path=corner.map_path, use_sim_time=True, no_data_warning_s=0.5,
-        image_topic="front/image", refine__round=2, publish_tf=True,
+    with Spinning(Node("lossy_camera")) as camera, node_process(
+        tmp_path, "/front/image:=/rear/image", map_path=corner.map_path, use_sim_time=True,
+        no_data_warning_s=0.5, image_topic="front/image", image_qos="reliable", refine__round=2,
+        publish_tf=True,
     ) as node:  # fmt: skip
         assert node.says("use_sim_time is set, but nothing is heard on /clock", 30), node.log
-        assert node.says("/front/image has 0 publishers, 0 images received", 10), node.log
+        assert node.says("/rear/image has 0 publishers, 0 images received", 10), node.log
         assert "/camera/camera_info has 0 publishers" in node.log
         assert "did you mean 'refine.rounds'?" in node.log
+        there = importlib.util.find_spec("tf2_msgs") is not None
+        assert ("tf2_msgs is not installed" in node.log) != there
+        camera.create_publisher(Image, "/rear/image", qos_profile_sensor_data)
+        assert node.says("offering incompatible QoS", 10), node.log
+        assert node.says("/rear/image has 1 publishers, 0 images received", 10), node.log
         assert node.end() == 0
 
 
