@@ -32,7 +32,8 @@ FLAGS = [
     "-Wall",
     "-Wextra",
     "-Wno-psabi",
-    "-Wno-maybe-uninitialized",  # false alarms inside GCC's own intrinsics headers
+    "-Wno-maybe-uninitialized",
+    "-Wno-uninitialized",  # both: false alarms inside GCC's own intrinsics headers
     "-g0",
 ]
 X86_KERNELS = {
@@ -107,7 +108,9 @@ class BuildNative(build_ext):
 
 # why each one: docs/dependencies.md
 DEPENDENCIES = [
-    "kornia>=0.8.2,<0.10",
+    # XFeat came with 0.9, which needs Python 3.11; without it SIFT is used
+    "kornia>=0.9,<0.10; python_version >= '3.11'",
+    "kornia>=0.8.2,<0.9; python_version < '3.11'",
     "matplotlib>=3.10,<4",
     "mcap>=1.2,<2",
     "numpy>=2.0,<3",

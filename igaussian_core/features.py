@@ -85,8 +85,13 @@ class XFeatMatcher:
     min_similarity = 0.82  # the value of XFeat's authors
 
     def __init__(self) -> None:
+        import kornia
         import kornia.feature as KF
 
+        if not hasattr(KF, "XFeat"):
+            raise WeightsError(
+                f"kornia {kornia.__version__} has no XFeat; 0.9 has, which needs Python 3.11"
+            )
         self._xfeat: Any = KF.XFeat()
         _load_strictly(self._xfeat.net, _read_weights("xfeat.pt"), "xfeat.pt")
         self._xfeat.eval().to(memory_format=torch.channels_last)
