@@ -92,6 +92,7 @@ class GaussianMap:
         result: Render = self.rasterizer().render(
             camera, np.asarray(T_cam_scene, np.float64), background=background, threads=threads
         )
+        assert result.rgb is not None and result.depth is not None and result.alpha is not None
         return result.rgb, result.depth, result.alpha
 
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

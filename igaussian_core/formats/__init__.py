@@ -55,14 +55,14 @@ def _read(file: Path) -> RawGaussians:
         return sog.read_folder(file.parent)
     if file.suffix.lower() == ".splat":
         return splat.read(file)
-    raise MapError(f"{file}: {_what(magic)}; supported: {SUPPORTED}")
+    raise MapError(f"{file}: {_what(magic, file.suffix.lower())}; supported: {SUPPORTED}")
 
 
-def _what(magic: bytes) -> str:
+def _what(magic: bytes, suffix: str) -> str:
     if not magic:
         return "the file is empty"
-    if magic == b"glTF":
-        return "glTF is not supported (convert it to .ply or .spz)"
+    if magic == b"glTF" or suffix in (".gltf", ".ksplat"):
+        return f"{suffix or 'glTF'} is not supported (convert it to .ply or .spz)"
     if magic == b"PK\x03\x04":
         return "a damaged zip archive"
     return "not recognised as a file of 3D Gaussians"
