@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
 import typer
 from rich.console import Console
@@ -114,7 +113,7 @@ def _numbers(text: str | None, count: int, name: str) -> tuple[float, ...] | Non
 
 @map_app.command("compile")
 def map_compile(
-    source: Annotated[Path, typer.Argument(help="Gaussian map, .ply")],
+    source: Annotated[Path, typer.Argument(help="file of Gaussians: .ply, .spz, .sog, .splat")],
     output: Annotated[Path, typer.Option("-o", "--output", help="compiled map directory")],
     cameras: Annotated[
         Path | None,
@@ -143,50 +142,116 @@ def map_compile(
     console.print(
         f"{output}: {package.manifest.kind}, {len(package.gaussians):,} Gaussians, "
         f"{landmarks.view_count} source views, {len(landmarks.points):,} landmarks, "
-        f"{_folder_megabytes(output):.1f} MB"
+        f"{_megabytes(output):.1f} MB"
     )
 
 
 @map_app.command("info")
-def map_info(path: Annotated[Path, typer.Argument(help=".igmap directory or .ply")]) -> None:
+def map_info(
+    path: Annotated[Path, typer.Argument(help=".igmap directory or a file of Gaussians")],
+    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+) -> None:
     """Say what a compiled map or a Gaussian file holds."""
+    rows = _describe(path)
+    if as_json:
+        print(json.dumps(rows))
+        return
     table = Table(show_header=False, title=str(path))
-    for key, value in _describe(path).items():
+    for key, value in rows.items():
         table.add_row(key, value)
     console.print(table)
 
 
 def _describe(path: Path) -> dict[str, str]:
     from igaussian_core.gaussian_map import load_map
-    from igaussian_core.map_package import open_package
+    from igaussian_core.map_package import is_package, open_package
+    from igaussian_core.map_summary import summarize
 
-    if path.is_dir():
-        package = open_package(path)
-        m, gmap = package.manifest, package.gaussians
-        rows = {
-            "compiled from": m.source_file,
-            "kind": m.kind,
-            "radius": f"{m.radius:.3g}",
-            "source views": str(package.landmarks.view_count),
-            "landmarks": f"{len(package.landmarks.points):,} ({m.matcher})",
-            "scale, map / scene": f"{package.T_map_scene.scale:.6g}",
-            "size on disk": f"{_folder_megabytes(path):.1f} MB",
-        }
-    else:
-        gmap, rows = load_map(path), {}
-    rows |= {
-        "Gaussians": f"{len(gmap):,}",
-        "left out on loading": str(gmap.dropped),
-        "SH degree": str(gmap.sh_degree),
-        "antialiased": "yes" if gmap.antialiased else "no",
+    if not is_package(path):
+        rows = summarize(load_map(path))
+        return rows | {"size on disk": f"{_megabytes(path):.1f} MB"}
+    package = open_package(path)
+    m = package.manifest
+    return {
+        "compiled from": m.source_file,
+        "kind": m.kind,
+        "radius": f"{m.radius:.3g}",
+        "source views": str(package.landmarks.view_count),
+        "landmarks": f"{len(package.landmarks.points):,} ({m.matcher})",
+        "scale, map / scene": f"{package.T_map_scene.scale:.6g}",
+        "size on disk": f"{_megabytes(path):.1f} MB",
+        **summarize(package.gaussians),
     }
-    if len(gmap):
-        low, high = gmap.bounds()
-        p5, p50, p95 = np.percentile(gmap.scales.max(axis=1), [5, 50, 95])
-        rows["bounds (98 %)"] = f"{np.round(low, 3).tolist()} to {np.round(high, 3).tolist()}"
-        rows["largest scale p5, p50, p95"] = f"{p5:.4g}, {p50:.4g}, {p95:.4g}"
-        rows["opacity below 0.05"] = f"{float((gmap.opacities < 0.05).mean()):.1%}"
-    return rows
+
+
+@map_app.command("convert")
+def map_convert(
+    source: Annotated[Path, typer.Argument(help="file of Gaussians in any supported format")],
+    output: Annotated[Path, typer.Option("-o", "--output", help=".ply or .spz")],
+) -> None:
+    """Write a file of Gaussians in another format, in the frame of a .ply."""
+    from igaussian_core.gaussian_map import load_map, save_map
+
+    gmap = load_map(source)
+    save_map(gmap, output)
+    console.print(
+        f"{output}: {len(gmap):,} Gaussians, {_megabytes(source):.1f} MB before, "
+        f"{_megabytes(output):.1f} MB now"
+    )
+
+
+@map_app.command("prune")
+def map_prune(
+    source: Annotated[Path, typer.Argument(help="file of Gaussians in any supported format")],
+    output: Annotated[Path, typer.Option("-o", "--output", help=".ply or .spz")],
+    keep: Annotated[
+        str | None, typer.Option(help="how many to keep: a count, or a share such as 50%")
+    ] = None,
+    max_ms: Annotated[
+        float | None, typer.Option(help="keep as many as render in this time, here", min=0.1)
+    ] = None,
+    cameras: Annotated[
+        Path | None, typer.Option(help="training cameras, as for map compile; default: found")
+    ] = None,
+    views: Annotated[int, typer.Option(help="most views to judge by", min=4, max=500)] = 48,
+    size: Annotated[int, typer.Option(help="longer side of the judged renders", min=32)] = 640,
+    threads: Annotated[int, typer.Option(help="threads of the renderer", min=1)] = 2,
+) -> None:
+    """Leave out the least important Gaussians; says what that costs in PSNR."""
+    from igaussian_core.compile_map import training_images
+    from igaussian_core.gaussian_map import load_map, save_map
+    from igaussian_core.overview import kind_of
+    from igaussian_core.pruning import prune
+    from igaussian_core.view_planning import plan_views
+
+    gmap = load_map(source)
+    count = _count(keep, len(gmap))
+    posed = training_images(source, cameras) if cameras is not None else []
+    with _progress() as progress:
+        plan = plan_views(
+            gmap, posed, kind=None if posed else kind_of(gmap), radius=None, up=None, count=views,
+            max_side=size, threads=threads, progress=_Stages(progress),
+        )  # fmt: skip
+    chosen = plan.views[:views]
+    result = prune(gmap, chosen, count, max_ms, threads)
+    save_map(result.gmap, output)
+    console.print(
+        f"{output}: {len(result.gmap):,} of {len(gmap):,} Gaussians; against the whole map at "
+        f"{len(result.psnr)} views: PSNR {result.psnr.mean():.1f} dB, worst "
+        f"{result.psnr.min():.1f} dB; a render takes {result.milliseconds:.1f} ms, before "
+        f"{result.milliseconds_before:.1f} ms ({threads} threads)"
+    )
+
+
+def _count(text: str | None, total: int) -> int | None:
+    """A count, or a share of `total` with a per cent sign."""
+    if text is None:
+        return None
+    try:
+        value = float(text[:-1]) / 100 * total if text.endswith("%") else int(text)
+    except ValueError as error:
+        raise ConfigError(f"--keep {text}: expected a count, or a share such as 50%") from error
+    return round(value)
 
 
 @map_app.command("align")
@@ -221,8 +286,10 @@ def map_align(
     console.print(f"{path}: T_map_scene = {json.dumps(manifest.T_map_scene)}")
 
 
-def _folder_megabytes(path: Path) -> float:
-    return sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) / 1e6
+def _megabytes(path: Path) -> float:
+    """Size of a file, or of all files in a folder."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(f.stat().st_size for f in files if f.is_file()) / 1e6
 
 
 FxOption = Annotated[float | None, typer.Option(help="focal length in pixels")]
@@ -230,40 +297,109 @@ FxOption = Annotated[float | None, typer.Option(help="focal length in pixels")]
 
 @app.command()
 def render(
-    source: Annotated[Path, typer.Argument(help=".ply or compiled map")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="picture to write")],
-    camera: Annotated[
-        Path, typer.Option(help="camera poses: poses.json, transforms.json, cameras.json, COLMAP")
+    source: Annotated[Path, typer.Argument(help="file of Gaussians or compiled map")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="picture; for --orbit a folder, .mp4 or .gif")
     ],
+    camera: Annotated[
+        Path | None,
+        typer.Option(help="camera poses, as for map compile; default: a view that shows the map"),
+    ] = None,
     index: Annotated[int, typer.Option(help="which of the cameras")] = 0,
     depth: Annotated[
-        Path | None, typer.Option(help="write depth too: 16-bit PNG, thousandths of a unit")
+        Path | None,
+        typer.Option(help="write depth too: 16-bit .png, thousandths of a unit where they fit"),
     ] = None,
+    depth_colour: Annotated[
+        Path | None, typer.Option(help="write depth as colours too: near red, far blue")
+    ] = None,
+    orbit: Annotated[
+        int | None, typer.Option(help="this many pictures around the view", min=2, max=10000)
+    ] = None,
+    size: Annotated[str, typer.Option(help="of the automatic view: WIDTHxHEIGHT")] = "960x720",
+    background: Annotated[
+        str | None, typer.Option(help="r,g,b in 0 to 1; default: white behind objects")
+    ] = None,
+    fps: Annotated[float, typer.Option(help="pictures a second of a video", min=0.1)] = 20.0,
 ) -> None:
-    """Render a map at one of a file's cameras."""
-    from igaussian_core.gaussian_map import load_map
+    """Make a picture of a map, a depth picture, or an orbit."""
     from igaussian_core.geometry import inverse
-    from igaussian_core.map_package import open_package
+    from igaussian_core.pictures import (
+        colour_depth,
+        depth_scale,
+        depth_steps,
+        to_uint8,
+        write_picture,
+        write_sequence,
+    )  # fmt: skip
+
+    look = _look(source, camera, index, _numbers(size.replace("x", ","), 2, "--size"))
+    colour = _numbers(background, 3, "--background") or look.background
+    if orbit is not None:
+        frames = (
+            to_uint8(look.gmap.render(look.camera, inverse(T), colour)[0])
+            for T in look.orbit(orbit)
+        )
+        console.print(f"{output}: {write_sequence(output, frames, fps)} pictures")
+        return
+    rgb, z, alpha = look.gmap.render(look.camera, inverse(look.T_scene_cam), colour)
+    write_picture(output, to_uint8(rgb))
+    if depth is not None:
+        scale = depth_scale(z)
+        write_picture(depth, depth_steps(z, scale))
+        console.print(f"{depth}: depth in steps of 1/{scale:g} scene unit, 0 where there is none")
+    if depth_colour is not None:
+        write_picture(depth_colour, colour_depth(z, alpha))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Look:
+    """A map and the view of it to render."""
+
+    gmap: Any
+    camera: Any
+    T_scene_cam: Any
+    background: tuple[float, ...]
+    kind: str
+
+    def orbit(self, count: int) -> Any:
+        from igaussian_core.overview import likely_up, orbit, view_target
+
+        up = likely_up(self.gmap, self.kind)
+        target = view_target(self.gmap, self.camera, self.T_scene_cam)
+        if self.kind == "object":
+            low, high = self.gmap.bounds()
+            target = 0.5 * (low + high)
+        return orbit(self.kind, self.T_scene_cam, target, up.vector, count)
+
+
+def _look(
+    source: Path, camera: Path | None, index: int, size: tuple[float, ...] | None
+) -> _Look:
+    """The map with the view that was asked for, else with one that shows it."""
+    from igaussian_core.errors import MapError
+    from igaussian_core.gaussian_map import load_map
+    from igaussian_core.map_package import is_package, open_package
+    from igaussian_core.overview import kind_of, overview
     from igaussian_core.posed_images import read_posed_images
 
-    gmap = open_package(source).gaussians if source.is_dir() else load_map(source)
+    package = open_package(source) if is_package(source) else None
+    gmap = package.gaussians if package else load_map(source)
+    if len(gmap) == 0:
+        raise MapError(f"{source}: the map holds no Gaussian: nothing to render")
+    kind = package.manifest.kind if package else kind_of(gmap)
+    background = (1.0, 1.0, 1.0) if kind == "object" else (0.0, 0.0, 0.0)
+    if package:
+        background = tuple(package.manifest.background)  # type: ignore[assignment]
+    if camera is None:
+        width, height = size or (960, 720)
+        view = overview(gmap, int(width), int(height), kind)
+        return _Look(gmap, view.camera, view.T_scene_cam, background, kind)
     posed = read_posed_images(camera)
     if not 0 <= index < len(posed):
         raise ConfigError(f"--index {index}: {camera} holds {len(posed)} cameras")
-    view = posed[index]
-    rgb, z, _ = gmap.render(view.camera.undistorted(), inverse(view.T_scene_cam))
-    _write_picture(output, np.clip(rgb[..., ::-1] * 255 + 0.5, 0, 255).astype(np.uint8))
-    if depth is not None:
-        _write_picture(depth, np.clip(z * 1000, 0, 65535).astype(np.uint16))
-
-
-def _write_picture(path: Path, image: Any) -> None:
-    try:
-        written = cv2.imwrite(str(path), image)
-    except cv2.error:
-        written = False
-    if not written:
-        raise ConfigError(f"{path}: cannot be written; supported: .png, .jpg in an existing folder")
+    chosen = posed[index]
+    return _Look(gmap, chosen.camera.undistorted(), chosen.T_scene_cam, background, kind)
 
 
 @app.command()

@@ -142,7 +142,9 @@ def save_map(gmap: GaussianMap, path: str | os.PathLike[str]) -> None:
 
 
 def file_sha256(path: str | os.PathLike[str]) -> str:
-    """Hexadecimal SHA-256 of a file's bytes."""
+    """Hexadecimal SHA-256 of a file's bytes; of a .sog folder, of its meta.json's bytes."""
+    if os.path.isdir(path):
+        path = Path(path) / "meta.json"
     with open(path, "rb") as stream:
         return _digest(iter(lambda: stream.read(1 << 20), b""))
 

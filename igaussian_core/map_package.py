@@ -128,6 +128,13 @@ def save_package(package: MapPackage, path: str | os.PathLike[str]) -> None:
         shutil.rmtree(staging, ignore_errors=True)
 
 
+def is_package(path: str | os.PathLike[str]) -> bool:
+    """Whether a path is meant as a compiled map: a folder, unless it is one of another format."""
+    return Path(path).is_dir() and not (
+        (Path(path) / "meta.json").is_file() and not (Path(path) / _MANIFEST).is_file()
+    )
+
+
 def open_package(path: str | os.PathLike[str]) -> MapPackage:
     """Read a compiled map and check that its parts belong together.
 

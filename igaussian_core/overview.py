@@ -60,15 +60,17 @@ class Overview:
     target: Array
 
 
-def overview(gmap: GaussianMap, width: int = 960, height: int = 720) -> Overview:
-    """Find the kind of map, its up axis and a camera that shows it.
+def overview(
+    gmap: GaussianMap, width: int = 960, height: int = 720, kind: str | None = None
+) -> Overview:
+    """Find the kind of map where it is not known, its up axis and a camera that shows it.
 
     Raises:
         MapError: the map is empty.
     """
     low, high = gmap.bounds()
     camera = _camera_of(width, height)
-    kind = kind_of(gmap)
+    kind = kind or kind_of(gmap)
     up = likely_up(gmap, kind)
     centre = 0.5 * (low + high)
     if kind == "object":
