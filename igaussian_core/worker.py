@@ -105,6 +105,9 @@ class NewestFrameWorker(Generic[Item]):
             for function, future in calls:
                 _run_call(function, future)
             if stopping:
+                with self._condition:
+                    self._busy = False
+                    self._condition.notify_all()
                 return
             if item is not None:
                 self._process(item)

@@ -219,9 +219,9 @@ def test_robot_keeps_clear_of_furniture(room: Room) -> None:
 def test_ray_caster_measures_known_walls(room: Room) -> None:
     T_map_cam = np.eye(4)
     T_map_cam[:3, :3] = demo_drive.optical(np.radians(-90.0), 0.0)  # at the bare south wall
-    T_map_cam[:3, 3] = 1.5, 2.0, 1.2
+    T_map_cam[:3, 3] = 1.6, 3.0, 1.2
     colour, depth = RayCaster(room).cast(sensor.make_rays(), T_map_cam)
-    assert depth[238, 321] == pytest.approx(2.0, abs=1e-4)
+    assert depth[238, 321] == pytest.approx(3.0, abs=1e-4)
     assert depth.min() > 0
     # the floor under the camera's lowest rays: 1.2 m below, by similar triangles
     rays = sensor.make_rays()
