@@ -13,7 +13,7 @@ import platform
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,6 +51,7 @@ BUNDLED_LIMITS: Mapping[str, float] = {
     "rss_mb": 1500.0,
 }
 _ROWS = 12  # lines of the live table
+_COLUMNS = ("t [s]", "x [m]", "y [m]", "z [m]", "error", "", "inliers", "latency", "rate")
 
 
 @dataclass(frozen=True)
@@ -295,9 +296,10 @@ class DriveTable:
         if self._live is not None:
             self._live.update(self._view())
         elif frame.time_s - self._last_line >= 1.0 or frame.T_map_cam is None:
+            if self._last_line < 0:
+                self._line(_COLUMNS)
             self._last_line = frame.time_s
-            cells = " ".join(f"{cell:>9}" for cell in self._cells(frame))
-            self._console.print(cells, highlight=False, soft_wrap=True)
+            self._line(self._cells(frame))
 
     def tick(self, state: str) -> None:
         """Say what is being waited for."""
@@ -308,6 +310,10 @@ class DriveTable:
             self._live.update(self._view())
         else:
             self._console.print(state, highlight=False, soft_wrap=True)
+
+    def _line(self, cells: Sequence[str]) -> None:
+        text = " ".join(f"{cell:>9}" for cell in cells)
+        self._console.print(Text(text), soft_wrap=True)
 
     def _hz(self) -> float:
         if len(self._arrivals) < 2:
@@ -328,8 +334,8 @@ class DriveTable:
 
     def _view(self) -> Group:
         table = Table(box=None, pad_edge=False)
-        for name in ("t [s]", "x [m]", "y [m]", "z [m]", "error", "", "inliers", "latency", "rate"):
-            table.add_column(name, justify="right", min_width=7)
+        for name in _COLUMNS:
+            table.add_column(Text(name), justify="right", min_width=7)
         for frame in self._frames:
             table.add_row(*self._cells(frame), style="red" if frame.T_map_cam is None else "")
         processed, accepted = self._counts
