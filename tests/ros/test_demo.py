@@ -102,7 +102,7 @@ def test_the_bundled_drive(tmp_path: Path) -> None:
     """The first seconds of it; the whole is `make demo`."""
     if not (ROOT / "bags" / "demo" / "drive").is_dir():
         pytest.skip("no bundled demo in this checkout")
-    figures, output = _demo(tmp_path, "--duration", 6)
+    figures, output = _demo(tmp_path, "--duration", 4)
     assert figures["accepted_ratio"] >= 0.95
     assert figures["median_error_m"] < 0.02 and figures["median_error_deg"] < 0.3
     assert figures["max_error_m"] < 0.10 and figures["max_error_deg"] < 2.0
