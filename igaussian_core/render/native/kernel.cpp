@@ -72,17 +72,17 @@ inline void colour_of_degree(const Model& model, size_t at, F x, F y, F z, F* rg
 
 inline void file(Bins* bins, int tile, uint64_t key) {
   TileList& list = bins->tiles[tile];
-  Chunk* chunk = list.tail;
-  if (__builtin_expect(chunk == nullptr || chunk->size == Chunk::kKeys, 0)) {
+  if (__builtin_expect(list.used == Chunk::kKeys, 0)) {
     Chunk* fresh = take_chunk(&bins->arena);
     if (fresh == nullptr) {
       bins->out_of_memory = true;
       return;
     }
-    (chunk ? chunk->next : list.head) = fresh;
-    list.tail = chunk = fresh;
+    (list.tail ? list.tail->next : list.head) = fresh;
+    list.tail = fresh;
+    list.used = 0;
   }
-  chunk->keys[chunk->size++] = key;
+  list.tail->keys[list.used++] = key;
 }
 
 // W projected Gaussians.

@@ -201,6 +201,8 @@ class Renderer {
  private:
   void prepare(const Frame& frame);
   void project(int thread, const View& view);
+  size_t count_keys(int tile) const;
+  void gather_keys(int tile, uint64_t* keys);
   void blend(int thread, const View& view, const Images& images);
   Pool& pool(int threads);
 
@@ -234,7 +236,7 @@ void Renderer::prepare(const Frame& frame) {
     workers_.push_back(std::make_unique<Worker>());
   }
   for (auto& worker : workers_) {
-    worker->tiles.assign(tiles, TileList{nullptr, nullptr});
+    worker->tiles.assign(tiles, TileList{nullptr, nullptr, Chunk::kKeys});
     Bins& bins = worker->bins;
     bins.tiles = worker->tiles.data();
     reset(&bins.arena);
@@ -258,6 +260,30 @@ void Renderer::project(int thread, const View& view) {
   worker.nanoseconds[0] += since(start);
 }
 
+size_t Renderer::count_keys(int tile) const {
+  size_t n = 0;
+  for (const auto& worker : workers_) {
+    const TileList& list = worker->tiles[tile];
+    for (const Chunk* c = list.head; c; c = c->next) n += keys_in(list, c);
+  }
+  return n;
+}
+
+// Copies the keys of a tile; their splats come into the cache on the way.
+void Renderer::gather_keys(int tile, uint64_t* keys) {
+  const Splat* splats = splats_.data();
+  for (const auto& worker : workers_) {
+    const TileList& list = worker->tiles[tile];
+    for (const Chunk* c = list.head; c; c = c->next) {
+      const int64_t size = keys_in(list, c);
+      for (int64_t i = 0; i < size; ++i) {
+        *keys++ = c->keys[i];
+        __builtin_prefetch(&splats[static_cast<uint32_t>(c->keys[i])]);
+      }
+    }
+  }
+}
+
 void Renderer::blend(int thread, const View& view, const Images& images) {
   Worker& worker = *workers_[thread];
   const int tiles = tiles_x_ * tiles_y_;
@@ -265,23 +291,10 @@ void Renderer::blend(int thread, const View& view, const Images& images) {
   for (;;) {
     const int tile = next_.fetch_add(1, std::memory_order_relaxed);
     if (tile >= tiles) break;
-    size_t n = 0;
-    for (const auto& other : workers_) {
-      for (const Chunk* c = other->tiles[tile].head; c; c = c->next) n += c->size;
-    }
+    const size_t n = count_keys(tile);
     uint64_t* keys = worker.keys.at_least(n);
     uint64_t* spare = worker.spare.at_least(n);
-    size_t filled = 0;
-    for (const auto& other : workers_) {
-      for (const Chunk* c = other->tiles[tile].head; c; c = c->next) {
-        if (c->next) __builtin_prefetch(c->next->keys + Chunk::kKeys);
-        for (int64_t i = 0; i < c->size; ++i) {
-          keys[filled + i] = c->keys[i];
-          __builtin_prefetch(&splats_.data()[static_cast<uint32_t>(c->keys[i])]);
-        }
-        filled += c->size;
-      }
-    }
+    gather_keys(tile, keys);
     sort_keys(keys, spare, n);
     worker.bins.entries += n;
     const auto sorted = Clock::now();

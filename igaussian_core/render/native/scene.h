@@ -85,16 +85,21 @@ struct alignas(64) Splat {
 static_assert(sizeof(Splat) == 64, "one cache line");
 
 struct Chunk {
-  static constexpr int kKeys = 62;
+  static constexpr int kKeys = 63;
   uint64_t keys[kKeys];  // depth bits << 32 | splat number
   Chunk* next;
-  int64_t size;
 };
 static_assert(sizeof(Chunk) == 512, "eight cache lines");
 
+// Every chunk but the last is full.
 struct TileList {
   Chunk *head, *tail;
+  int64_t used;  // keys in the tail; kKeys in an empty list, so that the first key takes a chunk
 };
+
+static inline int64_t keys_in(const TileList& list, const Chunk* chunk) {
+  return chunk == list.tail ? list.used : Chunk::kKeys;
+}
 
 // Chunks handed out one by one and taken back all at once; the slabs stay for the next frame.
 struct Slab {
@@ -122,7 +127,6 @@ static inline Chunk* take_chunk(Arena* arena) {
   }
   Chunk* chunk = &arena->current->chunks[arena->used++];
   chunk->next = nullptr;
-  chunk->size = 0;
   return chunk;
 }
 
