@@ -217,6 +217,7 @@ def _best_scene_view(
     rng = np.random.default_rng(0)
     likely = likely_camera_positions(gmap, low, high, samples=1500)
     positions = [np.median(likely, axis=0), *likely[:: max(1, len(likely) // 11)]]
+    positions.append(np.zeros(3))  # where the first camera of many trackers stood
     small = camera.scaled_to_fit(128)
     best, best_score = look_at(positions[0], 0.5 * (low + high), up), -1.0
     for position in positions:
@@ -230,10 +231,13 @@ def _best_scene_view(
 
 
 def _clarity(gmap: GaussianMap, camera: Camera, T_scene_cam: Array, clearance: float) -> float:
-    """Share of pixels with a surface; less where much of it is right ahead."""
-    _, depth, alpha = gmap.render(camera, inverse(T_scene_cam))
+    """Share of pixels with a surface, times its detail; less where things are right ahead."""
+    rgb, depth, alpha = gmap.render(camera, inverse(T_scene_cam))
     solid = alpha > 0.5
     if not solid.any():
         return 0.0
     near = float(np.percentile(depth[solid], 5))
-    return float(trusted_depth(depth, alpha, 0.8, 0.1).mean()) * min(1.0, near / clearance)
+    grey = np.clip(rgb, 0, 1).mean(axis=2)
+    detail = float(np.abs(np.diff(grey, axis=0)).mean() + np.abs(np.diff(grey, axis=1)).mean())
+    surface = float(trusted_depth(depth, alpha, 0.8, 0.1).mean())
+    return surface * min(1.0, near / clearance) * min(detail, 0.05)
