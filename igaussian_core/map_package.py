@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from igaussian_core.errors import MapError
@@ -121,9 +122,9 @@ def save_package(package: MapPackage, path: str | os.PathLike[str]) -> None:
     try:
         _write(package, staging)
         staging.chmod(0o755)
-        if target.exists():
-            shutil.rmtree(target)
-        staging.rename(target)
+        _replace(target, staging)
+    except (OSError, SafetensorError) as error:
+        raise MapError(f"{target}: cannot be written: {error}") from error
     finally:
         shutil.rmtree(staging, ignore_errors=True)
 
@@ -133,6 +134,17 @@ def is_package(path: str | os.PathLike[str]) -> bool:
     return Path(path).is_dir() and not (
         (Path(path) / "meta.json").is_file() and not (Path(path) / _MANIFEST).is_file()
     )
+
+
+def _replace(target: Path, staging: Path) -> None:
+    """Put a finished directory at `target`; an older one is deleted after that only."""
+    if not target.exists():
+        staging.rename(target)
+        return
+    old = staging.with_name(staging.name + "-old")
+    target.rename(old)
+    staging.rename(target)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def open_package(path: str | os.PathLike[str]) -> MapPackage:
@@ -158,9 +170,13 @@ def with_T_map_scene(path: str | os.PathLike[str], T_map_scene: Sim3) -> Manifes
     """Give a compiled map another `T_map_scene`; returns the new manifest.
 
     Raises:
-        MapError: no compiled map.
+        MapError: no compiled map, or no similarity (not finite, scale 0).
     """
     folder = Path(path)
+    try:
+        Sim3.from_matrix(T_map_scene.matrix())
+    except ValueError as error:
+        raise MapError(f"{folder}: T_map_scene is left as it was: {error}") from error
     manifest = dataclasses.replace(
         _read_manifest(folder), T_map_scene=T_map_scene.matrix().tolist()
     )
@@ -212,10 +228,21 @@ def _read_manifest(folder: Path) -> Manifest:
         )
     try:
         manifest = Manifest(**data)
-        Sim3.from_matrix(manifest.T_map_scene)
+        _check_values(manifest)
     except (TypeError, ValueError) as error:
         raise MapError(f"{file}: damaged manifest: {error}") from error
     return manifest
+
+
+def _check_values(manifest: Manifest) -> None:
+    Sim3.from_matrix(manifest.T_map_scene)
+    for name in ("name", "kind", "matcher", "source_file", "source_sha256", "gaussians_sha256"):
+        if not isinstance(getattr(manifest, name), str):
+            raise ValueError(f"{name} is no text")
+    for name, shape in (("background", (3,)), ("bounds", (2, 3)), ("radius", ())):
+        values = np.asarray(getattr(manifest, name), np.float64)
+        if values.shape != shape or not np.isfinite(values).all():
+            raise ValueError(f"{name} is not {shape or 'one'} finite numbers")
 
 
 def _read_landmarks(file: Path) -> Landmarks:
