@@ -56,8 +56,8 @@ class FeatureConfig:
 class CoarseConfig:
     """Stage one: landmarks compiled from the map."""
 
-    rank_keypoints: int = _option(384, "query keypoints that rank the source views", 32, 4096)
-    rank_landmarks: int = _option(384, "landmarks of each source view used in ranking", 32, 4096)
+    rank_keypoints: int = _option(256, "query keypoints that rank the source views", 32, 4096)
+    rank_landmarks: int = _option(192, "landmarks of each source view used in ranking", 32, 4096)
     top_views: int = _option(8, "source views matched in full", 1, 64)
     max_reprojection_px: float = _option(8.0, "inlier threshold of landmark PnP in pixels", 0.5, 64)
     min_inliers: int = _option(12, "least inliers of a hypothesis", 4, 1000)
