@@ -33,6 +33,7 @@ from igaussian_core.evaluate.drive import DriveFrame, MemorySample, Trajectory, 
 from igaussian_core.evaluate.drive_overlays import make_overlays
 from igaussian_core.evaluate.drive_recording import write_recording
 from igaussian_core.evaluate.drive_report import Drive, missed, plain, write_report
+from igaussian_core.features import make_matcher
 from igaussian_core.gaussian_map import file_sha256
 from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import open_package
@@ -158,7 +159,7 @@ def prepare_map(options: DemoOptions, console: Console) -> Path:
     if not source.exists():
         raise IGaussianError(f"{source}: no such file")
     target = options.work_dir / f"{source.stem}.igmap"
-    if _is_current(target, source):
+    if _is_current(target, source, options.config):
         console.print(f"map {target}: compiled already")
         return target
     cameras = options.cameras
@@ -182,13 +183,15 @@ def prepare_map(options: DemoOptions, console: Console) -> Path:
     return target
 
 
-def _is_current(target: Path, source: Path) -> bool:
+def _is_current(target: Path, source: Path, config: Config) -> bool:
     if not target.is_dir():
         return False
     try:
-        return open_package(target).manifest.source_sha256 == file_sha256(source)
+        manifest = open_package(target).manifest
     except IGaussianError:
         return False
+    same_features = manifest.matcher == make_matcher(config.features).name
+    return same_features and manifest.source_sha256 == file_sha256(source)
 
 
 def _bundled(name: str) -> Path:

@@ -133,6 +133,7 @@ def ride_with_ros(
         replay += ["--duration", str(options.duration_s)]
     arguments = node_arguments(topics, map_path, options)
     with (
+        _ending_on_sigterm(),
         _listening(topics.truth) as listener,
         Child("igaussian_ros.localizer_node", arguments, logs / "localizer.log") as node,
     ):
@@ -150,6 +151,20 @@ def ride_with_ros(
     begin_s = watch.frames[0].arrived_s if watch.frames else 0.0
     memory = [MemorySample(m.time_s - begin_s, m.rss_mb) for m in memory if m.time_s >= begin_s]
     return Ride(watch.frames, memory, "over DDS: node and replay as processes of their own")
+
+
+@contextmanager
+def _ending_on_sigterm() -> Iterator[None]:
+    """Leave by way of the blocks that end the child processes."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def header_stamps(bag: Bag, topic: str) -> list[int]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,11 +14,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from harness import ROOT
+from harness import ROOT, wait_until
 from rich.console import Console
 from scene import START_NS, STEP_NS
 
 from igaussian_core.bags import Bag
+from igaussian_core.config import Config
 from igaussian_core.evaluate.drive import Trajectory
 from igaussian_core.geometry import compose, pose_error
 from igaussian_core.map_package import open_package
@@ -88,6 +91,27 @@ def _check_recording(path: Path, poses: list[np.ndarray], accepted: int) -> None
         assert angle < 2.0 and distance < 0.10
 
 
+def test_nothing_is_left_running_when_the_demo_is_ended(corner, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "igaussian_core.cli", "demo", "--rate", "0.1"]
+    command += ["--bag", str(corner.bag), "--map", str(corner.map_path)]
+    log = tmp_path / "demo.log"
+    with log.open("wb") as stream:
+        process = subprocess.Popen(
+            command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdin=subprocess.DEVNULL, stdout=stream, stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )  # fmt: skip
+    try:
+        assert wait_until(lambda: "replaying over DDS" in log.read_text(), 60), log.read_text()
+        assert len(_processes_with(str(corner.map_path))) == 2  # the demo and its node
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) != 0
+    finally:
+        process.kill()
+    assert not _processes_with(str(corner.map_path))
+    assert not _processes_with(str(corner.bag))
+
+
 def test_without_ros(corner, tmp_path: Path) -> None:
     figures, output = _demo(
         tmp_path, "--bag", corner.bag, "--map", corner.map_path, "--no-ros", "--duration", 2
@@ -135,6 +159,10 @@ def test_the_map_is_compiled_once_and_again_when_it_changes(
     options = demo.DemoOptions(bag=corner.bag, map=source, work_dir=tmp_path / "out")
     target = demo.prepare_map(options, Console(quiet=True))
     assert compiled == [] and open_package(target).manifest.name == "corner"
+    sift = dataclasses.replace(options, config=Config.from_flat({"features.matcher": "sift"}))
+    demo.prepare_map(sift, Console(quiet=True))
+    assert compiled == [source]
+    compiled.clear()
     with source.open("ab") as file:
         file.write(b"\n")
     demo.prepare_map(options, Console(quiet=True))
