@@ -21,7 +21,7 @@ SH_C0 = 0.28209479177387814  # zeroth spherical harmonic, 1 / (2 sqrt(pi))
 SIGMA_FINE, SIGMA_COARSE = 0.58, 0.72  # standard deviation in cell sizes: detail, bare areas
 OPACITY = 0.99
 THICKNESS = 0.0015  # metres
-TOP_CELL, SMALLEST_CELL = 16, 2  # in half-resolution texels
+TOP_CELL, SMALLEST_CELL = 8, 2  # in half-resolution texels
 BORDER_FREE, BORDER_SHELL = 0.013, 0.03  # metres across a border
 LONGEST = 4  # aspect ratio of a cell
 CORRECTIONS = 5
@@ -132,12 +132,13 @@ def _may_split(cells: Ints) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
 
 
 def _visible(room: Room, surface: Surface, rows: int, cols: int) -> NDArray[np.bool_]:
-    """Which half-resolution texels are neither masked nor inside something solid."""
+    """Which half-resolution texels are in the room, neither masked nor inside a solid."""
     visible = np.ones((rows, cols), bool)
     if surface.mask is not None:
         visible = surface.mask[::2, ::2].copy()
     s, t = np.meshgrid((np.arange(cols) + 0.5) / cols, (np.arange(rows) + 0.5) / rows)
     points = surface.points(s, t) + surface.normal * 0.002
+    visible &= np.all((points > 0) & (points < [room.width, room.depth, room.height]), -1)
     low, high = points.min((0, 1)), points.max((0, 1))
     for solid in room.solids:
         reach = (np.abs(solid.axes) * solid.half[:, None]).sum(0)
