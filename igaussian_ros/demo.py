@@ -90,11 +90,12 @@ class DemoOptions:
 
 @dataclass(frozen=True)
 class Ride:
-    """What a way of running the drive brings back."""
+    """What a way of running the drive brings back; `refused` messages were not processed."""
 
     frames: list[DriveFrame]
     memory: list[MemorySample]
     how: str
+    refused: int = 0
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ def run_demo(
         ride = _ride(options, bag_path, map_path, truth, table.add, table.tick, console)
     if not ride.frames:
         raise IGaussianError(f"{bag_path}: no frame was processed ({ride.how})")
-    figures = summarize_drive(ride.frames, sent, ride.memory)
+    figures = summarize_drive(ride.frames, sent, ride.memory) | {"refused": float(ride.refused)}
     outcome = _write(options, bag_path, map_path, truth, ride, figures)
     if json_path is not None:
         json_path.parent.mkdir(parents=True, exist_ok=True)
@@ -349,7 +350,8 @@ def _print_outcome(console: Console, outcome: DemoOutcome, ride: Ride) -> None:
     figures = outcome.figures
     table = Table(title=f"The drive, {ride.how}", show_header=False)
     rows = (
-        ("frames", "{accepted:.0f} accepted of {processed:.0f} processed, {sent:.0f} sent"),
+        ("frames", "{accepted:.0f} accepted of {processed:.0f} processed; {sent:.0f} sent, "
+         "{refused:.0f} refused"),
         ("position error", "median {median_error_m:.4f} m, largest {max_error_m:.4f} m"),
         ("rotation error", "median {median_error_deg:.3f} deg, largest {max_error_deg:.3f} deg"),
         ("poses a second", "{rate_hz:.2f}"),

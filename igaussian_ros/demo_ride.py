@@ -35,7 +35,9 @@ Array = NDArray[np.float64]
 _START_S, _STOP_S = 90.0, 10.0
 _SAMPLE_S = 0.5
 _QUIET_S = 1.5  # after the replay: so long without news is the end
-_STATUSES = {status.value for status in Status}
+# a defect inside the pipeline counts against it; a refused message (stale, no camera_info) is
+# counted by itself
+_PROCESSED = {status.value for status in Status} | {"failed"}
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,8 @@ def ride_with_ros(
         console.print(f"[red]the node ended with status {status}, see {node.log}[/]")
     begin_s = watch.frames[0].arrived_s if watch.frames else 0.0
     memory = [MemorySample(m.time_s - begin_s, m.rss_mb) for m in memory if m.time_s >= begin_s]
-    return Ride(watch.frames, memory, "over DDS: node and replay as processes of their own")
+    how = "over DDS: node and replay as processes of their own"
+    return Ride(watch.frames, memory, how, watch.refused)
 
 
 @contextmanager
@@ -321,6 +324,7 @@ class _Watch:
         self._taken = 0
         self._offset_ns: float | None = None
         self.frames: list[DriveFrame] = []
+        self.refused = 0
 
     def take(self, final: bool = False) -> int:
         """Turn new statuses into frames; how many there were.
@@ -338,8 +342,10 @@ class _Watch:
                 break
             self._taken += 1
             count += 1
-            if status.values.get("status") in _STATUSES:
+            if status.values.get("status") in _PROCESSED:
                 self._add(status, pose)
+            else:
+                self.refused += 1
         return count
 
     def _pose_at(self, stamp_ns: int) -> tuple[Array, int] | None:
