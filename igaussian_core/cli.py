@@ -108,6 +108,15 @@ def _numbers(text: str | None, count: int, name: str) -> tuple[float, ...] | Non
         raise ConfigError(f"{name} '{text}': expected {count} numbers") from error
     if len(values) != count:
         raise ConfigError(f"{name} '{text}': expected {count} numbers, got {len(values)}")
+    if not np.isfinite(values).all():
+        raise ConfigError(f"{name} '{text}': expected finite numbers")
+    return values
+
+
+def _direction(text: str | None, name: str) -> tuple[float, ...] | None:
+    values = _numbers(text, 3, name)
+    if values is not None and not any(values):
+        raise ConfigError(f"{name} '{text}': a direction is not all zero")
     return values
 
 
@@ -132,7 +141,7 @@ def map_compile(
     from igaussian_core.compile_map import CompileOptions, compile_map
 
     options = CompileOptions(
-        kind=kind, radius=radius, up=_numbers(up, 3, "--up"), views=views  # type: ignore[arg-type]
+        kind=kind, radius=radius, up=_direction(up, "--up"), views=views  # type: ignore[arg-type]
     )
     with _progress() as progress:
         package = compile_map(
@@ -274,12 +283,12 @@ def map_align(
     if matrix is not None:
         try:
             T_map_scene = Sim3.from_matrix(json.loads(matrix.read_text()))
-        except (OSError, ValueError) as error:
+        except (OSError, TypeError, ValueError) as error:
             raise ConfigError(f"{matrix}: {error}") from error
     else:
         if not (np.isfinite(scale) and scale > 0):
             raise ConfigError(f"--scale {scale}: must be positive")
-        axis, point = _numbers(up, 3, "--up"), _numbers(origin, 3, "--origin")
+        axis, point = _direction(up, "--up"), _numbers(origin, 3, "--origin")
         rotation = up_rotation(np.array(axis)).T if axis else np.eye(3)
         T_map_scene = Sim3(scale, rotation, -scale * rotation @ np.array(point or (0.0,) * 3))
     manifest = with_T_map_scene(path, T_map_scene)
@@ -427,13 +436,15 @@ def localize(
 
     image = read_image(photo)
     height, width = image.shape[:2]
-    coefficients = tuple(float(v) for v in dist.split(",")) if dist else ()
+    coefficients = _numbers(dist, len(dist.replace(",", " ").split()), "--dist") if dist else None
     camera = Camera(
         width, height, fx, fy or fx,
         (width - 1) / 2 if cx is None else cx, (height - 1) / 2 if cy is None else cy,
-        model, coefficients,
+        model, coefficients or (),
     )  # fmt: skip
     guess = _numbers(prior, 7, "--prior")
+    if guess and not any(guess[3:]):
+        raise ConfigError(f"--prior '{prior}': the quaternion is all zero")
     T_prior = compose(rotation_from_quaternion(guess[3:]), guess[:3]) if guess else None
     result = Localizer.open(map_path, load_config(config, set_)).localize(image, camera, T_prior)
     if as_json:
@@ -468,7 +479,8 @@ def _print_result(result: Any) -> None:
         quaternion = np.round(quaternion_from_rotation(result.T_map_cam[:3, :3]), 5).tolist()
         sigma = np.sqrt(np.diag(result.covariance))
         console.print(f"position x y z    {position}  +- {np.round(sigma[:3], 4).tolist()}")
-        console.print(f"rotation w x y z  {quaternion}  +- {np.round(np.degrees(sigma[3:]), 3)} deg")
+        degrees = np.round(np.degrees(sigma[3:]), 3).tolist()
+        console.print(f"rotation w x y z  {quaternion}  +- {degrees} deg")
     console.print({stage: round(ms, 1) for stage, ms in result.timings_ms.items()})
 
 

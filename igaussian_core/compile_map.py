@@ -18,7 +18,13 @@ from igaussian_core.features import Matcher, make_matcher
 from igaussian_core.gaussian_map import GaussianMap, file_sha256, load_map
 from igaussian_core.geometry import Sim3, inverse, transform_points
 from igaussian_core.lifting import at_pixels, sample, trusted_depth, unproject
-from igaussian_core.map_package import Landmarks, Manifest, MapPackage, save_package
+from igaussian_core.map_package import (
+    Landmarks,
+    Manifest,
+    MapPackage,
+    check_target,
+    save_package,
+)
 from igaussian_core.posed_images import PosedImage, read_posed_images
 from igaussian_core.view_planning import SourceView, plan_views
 from igaussian_core.views import KINDS
@@ -83,8 +89,8 @@ def compile_map(
         MapError, DatasetError: unusable input; nothing at `target` is touched then.
     """
     source, options, config = Path(source), options or CompileOptions(), config or Config()
-    if options.kind is not None and options.kind not in KINDS:
-        raise MapError(f"kind '{options.kind}' is none of {', '.join(KINDS)}")
+    _check_options(options)
+    check_target(target)
     gmap = load_map(source)
     if len(gmap) == 0:
         raise MapError(f"{source}: the map holds no Gaussian")
@@ -112,6 +118,15 @@ def compile_map(
     package = MapPackage(manifest, gmap, landmarks)
     save_package(package, target)
     return package
+
+
+def _check_options(options: CompileOptions) -> None:
+    if options.kind is not None and options.kind not in KINDS:
+        raise MapError(f"kind '{options.kind}' is none of {', '.join(KINDS)}")
+    if options.radius is not None and not 0 < options.radius < np.inf:
+        raise MapError(f"radius {options.radius} is not positive")
+    if options.up is not None and not 0 < np.linalg.norm(options.up) < np.inf:
+        raise MapError(f"up {options.up} is no direction")
 
 
 def training_images(source: Path, cameras: str | Path) -> list[PosedImage]:

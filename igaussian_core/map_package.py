@@ -112,8 +112,7 @@ def save_package(package: MapPackage, path: str | os.PathLike[str]) -> None:
         MapError: `path` exists and is no compiled map, or cannot be written.
     """
     target = Path(path)
-    if target.exists() and not (target / _MANIFEST).is_file():
-        raise MapError(f"{target}: exists and is no compiled map; it is left alone")
+    check_target(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         staging = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
@@ -134,6 +133,13 @@ def is_package(path: str | os.PathLike[str]) -> bool:
     return Path(path).is_dir() and not (
         (Path(path) / "meta.json").is_file() and not (Path(path) / _MANIFEST).is_file()
     )
+
+
+def check_target(path: str | os.PathLike[str]) -> None:
+    """Before long work: raise MapError where `save_package` would not overwrite."""
+    target = Path(path)
+    if target.exists() and not (target / _MANIFEST).is_file():
+        raise MapError(f"{target}: exists and is no compiled map; it is left alone")
 
 
 def _replace(target: Path, staging: Path) -> None:

@@ -49,7 +49,7 @@ def read(file: Path) -> RawGaussians:
 def write(gaussians: RawGaussians, file: Path) -> None:
     """Write INRIA's binary little-endian .ply (float32, no normals)."""
     count, coefficients = gaussians.sh.shape[:2]
-    rest = np.transpose(gaussians.sh[:, 1:], (0, 2, 1)).reshape(count, -1)
+    rest = np.transpose(gaussians.sh[:, 1:], (0, 2, 1)).reshape(count, 3 * (coefficients - 1))
     opacity = np.clip(gaussians.opacities.astype(np.float64), 1e-7, 1 - 1e-7)
     scales = gaussians.scales
     columns: list[tuple[str, NDArray[Any]]] = [
@@ -83,7 +83,7 @@ def _check_declared_sizes(file: Path) -> None:
         types = [line[1] for line in lines[1:] if len(line) > 2 and line[0] == b"property"]
         # ascii: a digit and a space; a list: at least its length
         row = sum(2 if ascii_text else _TYPE_BYTES.get(name, 1) for name in types)
-        if len(lines[0]) > 1 and lines[0][1].isdigit():
+        if lines and len(lines[0]) > 1 and lines[0][1].isdigit():
             least += int(lines[0][1]) * max(row, 1)
     size = file.stat().st_size
     if least > size:

@@ -17,15 +17,13 @@ CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 SH0 = 0.28209479177387814
 
 
-def room(seed: int, per_metre: float = 21.0, textured: bool = True) -> GaussianMap:
+def room(seed: int, per_metre: float = 21.0) -> GaussianMap:
     """Flat Gaussians on floor, ceiling and four walls, and on a box that stands in the room."""
     rng = np.random.default_rng(seed)
-    parts = [_plane(rng, origin, u, v, per_metre) for origin, u, v in _planes()]
+    parts = [plane(rng, origin, u, v, per_metre) for origin, u, v in _planes()]
     means = np.concatenate([part[0] for part in parts])
     quats = np.concatenate([part[1] for part in parts])
     colours = np.concatenate([part[2] for part in parts])
-    if not textured:
-        colours = np.full_like(colours, 0.5)
     sigma = 0.5 / per_metre
     return GaussianMap(
         means.astype(np.float32),
@@ -53,7 +51,7 @@ def _planes() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     return sides + box
 
 
-def _plane(
+def plane(
     rng: np.random.Generator, origin: np.ndarray, u: np.ndarray, v: np.ndarray, per_metre: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     lengths = np.linalg.norm(u), np.linalg.norm(v)

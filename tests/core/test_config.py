@@ -70,21 +70,21 @@ def test_an_integer_serves_as_float() -> None:
 
 
 def test_only_what_is_named_changes() -> None:
-    config = Config.from_flat({"refine.rounds": 2, "runtime.threads": 1})
-    assert config.refine.rounds == 2 and config.runtime.threads == 1
+    config = Config.from_flat({"coarse.top_views": 2, "runtime.threads": 1})
+    assert config.coarse.top_views == 2 and config.runtime.threads == 1
     changed = {k for k, v in config.to_flat().items() if v != Config().to_flat()[k]}
-    assert changed <= {"refine.rounds", "runtime.threads"}
+    assert changed == {"coarse.top_views", "runtime.threads"}
 
 
-@pytest.mark.parametrize("name", ["refine.round", "rounds", "refine", "", "refine.rounds.x"])
+@pytest.mark.parametrize("name", ["coarse.top", "top_views", "coarse", "", "coarse.top_views.x"])
 def test_unknown_key_is_refused_with_what_is_known(name: str) -> None:
-    with pytest.raises(ConfigError, match="unknown key.*refine.rounds"):
+    with pytest.raises(ConfigError, match="unknown key.*coarse.top_views"):
         Config.from_flat({name: 1})
 
 
 def test_configuration_is_frozen() -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
-        Config().refine.rounds = 7  # type: ignore[misc]
+        Config().coarse.top_views = 7  # type: ignore[misc]
 
 
 def test_file_round_trip(tmp_path: Path) -> None:
@@ -101,8 +101,9 @@ def test_file_round_trip(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "", "{", "3", "[]", '{"refine": 3}', '{"refine": {"speed": 1}}', '{"refine.rounds": 2}',
-        '{"nothing": {"rounds": 1}}', '{"refine": {"rounds": "2"}}', '{"refine": {"rounds": 99}}',
+        "", "{", "3", "[]", '{"coarse": 3}', '{"coarse": {"speed": 1}}', '{"coarse.top_views": 2}',
+        '{"nothing": {"top_views": 1}}', '{"coarse": {"top_views": "2"}}',
+        '{"coarse": {"top_views": 99}}',
         "\udcff",
     ],
 )  # fmt: skip
@@ -120,5 +121,5 @@ def test_missing_file_is_named(tmp_path: Path) -> None:
 
 def test_partial_file(tmp_path: Path) -> None:
     file = tmp_path / "config.json"
-    file.write_text(json.dumps({"refine": {"rounds": 1}}))
-    assert Config.from_file(file) == Config.from_flat({"refine.rounds": 1})
+    file.write_text(json.dumps({"coarse": {"top_views": 1}}))
+    assert Config.from_file(file) == Config.from_flat({"coarse.top_views": 1})
