@@ -4,6 +4,12 @@ against (`igaussian_core.render.reference`).
 
 from __future__ import annotations
 
-from igaussian_core.render.rasterizer import Rasterizer, Render, RenderStats, available_simd
+from igaussian_core.render.rasterizer import (
+    Rasterizer,
+    Render,
+    RenderGradients,
+    RenderStats,
+    available_simd,
+)
 
-__all__ = ["Rasterizer", "Render", "RenderStats", "available_simd"]
+__all__ = ["Rasterizer", "Render", "RenderGradients", "RenderStats", "available_simd"]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from igaussian_core.errors import IGaussianError
 
-ABI = 1
+ABI = 2
 SIMD = ("avx512", "avx2", "portable")  # best first
 SIMD_VARIABLE = "IGAUSSIAN_SIMD"
 STATUS_OK = 0
@@ -59,6 +59,22 @@ class Frame(ctypes.Structure):
     ]
 
 
+class Gradients(ctypes.Structure):
+    """Mirror of `struct Gradients` in native/gradient.h."""
+
+    _fields_ = [
+        ("rgb", _float_p),
+        ("depth", _float_p),
+        ("alpha", _float_p),
+        ("means", _float_p),
+        ("quats_wxyz", _float_p),
+        ("scales", _float_p),
+        ("opacities", _float_p),
+        ("sh", _float_p),
+        ("T_cam_scene", ctypes.c_double * 16),
+    ]
+
+
 def library_path() -> Path | None:
     """Where the built library lies, next to this file; None where it was never built."""
     folder = Path(__file__).parent
@@ -91,6 +107,18 @@ def library() -> ctypes.CDLL:
     lib.igaussian_destroy.argtypes = [ctypes.c_void_p]
     lib.igaussian_destroy.restype = None
     lib.igaussian_render.argtypes = [ctypes.c_void_p, ctypes.POINTER(Frame)]
+    lib.igaussian_render_batch.argtypes = [
+        ctypes.c_void_p,
+        ctypes.POINTER(Frame),
+        ctypes.c_int,
+        ctypes.c_int,
+    ]
+    lib.igaussian_backward.argtypes = [
+        ctypes.c_void_p,
+        ctypes.POINTER(Frame),
+        ctypes.POINTER(Gaussians),
+        ctypes.POINTER(Gradients),
+    ]
     return lib
 
 

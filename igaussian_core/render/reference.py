@@ -44,7 +44,7 @@ class Projection(NamedTuple):
     colour: Tensor  # [M, 3]
     z: Tensor  # [M]
     extent: Tensor  # [M, 2]
-    index: Tensor  # [M] int64
+    source: Tensor  # [M] int64, position in the inputs
 
 
 def rotation_matrices(quats_wxyz: Tensor) -> Tensor:
@@ -178,7 +178,7 @@ def _blend(p: Projection, pixels: Tensor, background: Tensor) -> list[Tensor]:
         half = torch.cumsum(weight.detach(), 0) >= 0.5
         first = half.to(torch.int8).argmax(0)
         median = torch.where(half.any(0), p.z[first], 0.0)
-        ids = torch.where(drawn, p.index[weight.argmax(0)], -1)
+        ids = torch.where(drawn, p.source[weight.argmax(0)], -1)
     return [rgb, depth, total, median, ids]
 
 

@@ -422,37 +422,53 @@ inline uint64_t cells_inside(int width, int height) {
   return cells;
 }
 
+// Copies the next Gaussians side by side and finds the cells that they touch; returns their
+// number, rounded up to what list_row reads.
+inline int stage(const Splat* splats, const uint64_t* keys, int64_t left, int size, float tile_u,
+                 float tile_v, Batch* batch) {
+  constexpr int kAhead = 48;
+  const int padded = (size + 15) / 16 * 16;
+  for (int i = 0; i < size; ++i) {
+    if (i + kAhead < left) {
+      __builtin_prefetch(&splats[static_cast<uint32_t>(keys[i + kAhead])]);
+    }
+    batch->splats[i] = splats[static_cast<uint32_t>(keys[i])];
+  }
+  for (int i = size; i < padded; ++i) batch->splats[i] = batch->splats[kBatch];
+  for (int i = 0; i < padded; i += W) cells_touched(batch, i, tile_u, tile_v);
+  return padded;
+}
+
+// Calls visit(row, column, size of batch->list) for the live cells that the batch touches;
+// returns the cells of which visit says that they are finished.
+template <class Visit>
+inline uint64_t for_each_cell(Batch* batch, int padded, uint64_t live, Visit visit) {
+  uint64_t finished = 0;
+  for (int row = 0; row < 8; ++row) {
+    unsigned columns = static_cast<unsigned>(live >> (8 * row)) & 255u;
+    const int row_size = columns ? list_row(batch, padded, row) : 0;
+    if (row_size == 0) continue;
+    for (; columns; columns &= columns - 1) {
+      const int column = __builtin_ctz(columns);
+      const int size = list_cell(batch, row_size, column);
+      if (size && !visit(row, column, size)) finished |= 1ull << (8 * row + column);
+    }
+  }
+  return finished;
+}
+
 template <bool kExtra>
 int64_t blend_keys(const Splat* splats, const uint64_t* keys, int64_t n, float tile_u,
                    float tile_v, uint64_t live, Batch* batch, TileBuffer* buffer) {
-  constexpr int kAhead = 48;
   int64_t evaluated = 0;
   for (int64_t start = 0; start < n && live; start += kBatch) {
     const int size = static_cast<int>(n - start < kBatch ? n - start : kBatch);
-    const int padded = (size + 15) / 16 * 16;
-    for (int i = 0; i < size; ++i) {
-      if (start + i + kAhead < n) {
-        __builtin_prefetch(&splats[static_cast<uint32_t>(keys[start + i + kAhead])]);
-      }
-      batch->splats[i] = splats[static_cast<uint32_t>(keys[start + i])];
-    }
-    for (int i = size; i < padded; ++i) batch->splats[i] = batch->splats[kBatch];
-    for (int i = 0; i < padded; i += W) cells_touched(batch, i, tile_u, tile_v);
-    for (int row = 0; row < 8; ++row) {
-      unsigned columns = static_cast<unsigned>(live >> (8 * row)) & 255u;
-      const int row_size = columns ? list_row(batch, padded, row) : 0;
-      if (row_size == 0) continue;
-      for (; columns; columns &= columns - 1) {
-        const int column = __builtin_ctz(columns), cell = 8 * row + column;
-        const int count = list_cell(batch, row_size, column);
-        evaluated += count;
-        if (count == 0) continue;
-        const float cell_u = tile_u + kCell * column, cell_v = tile_v + kCell * row;
-        if (!blend_cell<kExtra>(*batch, count, cell_u, cell_v, buffer->cell[cell][0])) {
-          live &= ~(1ull << cell);
-        }
-      }
-    }
+    const int padded = stage(splats, keys + start, n - start, size, tile_u, tile_v, batch);
+    live &= ~for_each_cell(batch, padded, live, [&](int row, int column, int count) {
+      evaluated += count;
+      return blend_cell<kExtra>(*batch, count, tile_u + kCell * column, tile_v + kCell * row,
+                                buffer->cell[8 * row + column][0]);
+    });
   }
   return evaluated;
 }
@@ -542,9 +558,165 @@ int64_t blend(const View& view, const Splat* splats, const uint64_t* keys, int64
   return evaluated;
 }
 
+// ---------------------------------------------------------------- backward
+
+// With w_i the weight of Gaussian i, a_i its alpha, T_i the transmittance before it and v_i the
+// gradient of the loss by w_i:
+//   dL/da_i = T_i v_i - sum over j > i of w_j v_j / (1 - a_i).
+// The sum over all j is known from the forward pass; what lies before i is taken off it.
+
+// What is kept of a pixel; same size as the forward pass's planes.
+enum BackwardPlane { kBackT, kRest, kByRed, kByGreen, kByBlue, kByDepth, kByAlpha };
+
+constexpr int kBackwardBatch = 64;
+constexpr int kSums = 10;
+
+// For each Gaussian of a batch, sums over pixels, still W side by side.
+struct alignas(64) Sums {
+  float sum[kBackwardBatch][kSums][W];
+};
+
+// Gradients by rgb, depth and alpha at one pixel become those by the sums of w_i c_i, w_i z_i and
+// w_i, and the sum of w_j v_j over all.
+void start_pixel(float* cell, int l, size_t at, const Images& images, const ImageGradients& d) {
+  const float alpha = cell[kAlpha * kPixels + l], depth_sum = cell[kDepth * kPixels + l];
+  const float d_depth = d.depth && alpha > 0 ? d.depth[at] : 0.0f;
+  const float by_depth = alpha > 0 ? d_depth / alpha : 0.0f;
+  float by_alpha = (d.alpha ? d.alpha[at] : 0.0f);
+  if (alpha > 0) by_alpha -= by_depth * depth_sum / alpha;
+  float rest = by_depth * depth_sum;
+  for (int k = 0; k < 3; ++k) {
+    const float by_colour = d.rgb ? d.rgb[at * 3 + k] : 0.0f;
+    rest += by_colour * cell[(kRed + k) * kPixels + l];
+    by_alpha -= by_colour * images.background[k];
+    cell[(kByRed + k) * kPixels + l] = by_colour;
+  }
+  cell[kBackT * kPixels + l] = 1.0f;
+  cell[kRest * kPixels + l] = rest + by_alpha * alpha;
+  cell[kByDepth * kPixels + l] = by_depth;
+  cell[kByAlpha * kPixels + l] = by_alpha;
+}
+
+void start_backward(const View& view, int x0, int y0, uint64_t inside, const Images& images,
+                    const ImageGradients& d, TileBuffer* buffer) {
+  for (uint64_t m = inside; m; m &= m - 1) {
+    const int number = __builtin_ctzll(m);
+    float* cell = buffer->cell[number][0];
+    for (int l = 0; l < kPixels; ++l) {
+      const int x = x0 + kCell * (number & 7) + l % kCell;
+      const int y = y0 + kCell * (number >> 3) + l / kCell;
+      if (x < view.width && y < view.height) {
+        start_pixel(cell, l, static_cast<size_t>(y) * view.width + x, images, d);
+      } else {
+        // a pixel outside the image counts for nothing
+        for (int plane = 0; plane <= kByAlpha; ++plane) cell[plane * kPixels + l] = 0.0f;
+      }
+    }
+  }
+}
+
+// One Gaussian over W pixels, its sums added to.
+inline void backward_lanes(const Splat& s, F x, F y, float* pixels, float* sums) {
+  const F dx = x - splat(s.u), dy = y - splat(s.v);
+  const F p = splat(s.along) * dx + splat(s.shear) * dy, q = splat(s.across) * dy;
+  F a = splat(s.log_opacity) - p * p - q * q;
+  const M counts = at_least(a, splat(kLog2AlphaMin));
+  exp2_near<1>(&a);
+  const M free = at_least(splat(kAlphaMax), a);
+  a = keep(counts, smaller(a, splat(kAlphaMax)));
+  const auto plane = [&](int k) { return load(pixels + k * kPixels); };
+  const F before = plane(kBackT), after = minus_product(before, a, before);
+  store(pixels + kBackT * kPixels, after);
+  const M alive = at_least(after, splat(kStop));
+  const F weight = keep(alive, a * before);
+  const F by_weight = plane(kByRed) * splat(s.red) + plane(kByGreen) * splat(s.green) +
+                      plane(kByBlue) * splat(s.blue) + plane(kByDepth) * splat(s.z) +
+                      plane(kByAlpha);
+  const F rest = plane(kRest) - weight * by_weight;
+  store(pixels + kRest * kPixels, rest);
+  const F by_alpha = before * by_weight - rest / (splat(1.0f) - a);
+  const F by_power = keep(both(alive, both(counts, free)), a * by_alpha);
+  const F by_p = by_power * p, by_q = by_power * q;
+  const F terms[kSums] = {by_p,
+                          by_q,
+                          by_p * dx,
+                          by_p * dy,
+                          by_q * dy,
+                          by_power,
+                          weight * plane(kByRed),
+                          weight * plane(kByGreen),
+                          weight * plane(kByBlue),
+                          weight * plane(kByDepth)};
+  for (int k = 0; k < kSums; ++k) store(sums + k * W, load(sums + k * W) + terms[k]);
+}
+
+inline bool backward_cell(const Batch& batch, int size, float cell_u, float cell_v,
+                          float* pixels, Sums* sums) {
+  unsigned unfinished = 0;
+  for (int l = 0; l < kPixels; l += W) {
+    const F x = splat(cell_u) + load(kPixelOffsets.x + l);
+    const F y = splat(cell_v) + load(kPixelOffsets.y + l);
+    for (int i = 0; i < size; ++i) {
+      const uint32_t number = batch.list[i];
+      backward_lanes(batch.splats[number], x, y, pixels + l, sums->sum[number][0]);
+    }
+    unfinished |= bits(at_least(load(pixels + l), splat(kStop)));
+  }
+  return unfinished != 0;
+}
+
+// The sums over pixels, as gradients by the Gaussian's place and shape in the image.
+SplatGradient gather_sums(const Splat& s, const float (*sums)[W]) {
+  float total[kSums] = {};
+  for (int k = 0; k < kSums; ++k) {
+    for (int l = 0; l < W; ++l) total[k] += sums[k][l];
+  }
+  constexpr float kLn2 = 0.6931471805599453f;  // of alpha = 2^power
+  const float by_p = kLn2 * total[0], by_q = kLn2 * total[1];
+  return {2 * s.along * by_p,
+          2 * (s.shear * by_p + s.across * by_q),
+          -2 * kLn2 * total[2],
+          -2 * kLn2 * total[3],
+          -2 * kLn2 * total[4],
+          kLn2 * total[5],
+          {total[6], total[7], total[8]},
+          total[9]};
+}
+
+void blend_backward(const View& view, const Splat* splats, const uint64_t* keys, int64_t n,
+                    int tile_x, int tile_y, const Images& images, const ImageGradients& d,
+                    SplatGradient* gradients) {
+  TileBuffer buffer;
+  Batch batch;
+  Sums sums;
+  batch.splats[kBatch] = Splat{};
+  batch.splats[kBatch].log_opacity = -100.0f;
+  const int x0 = tile_x * kTile, y0 = tile_y * kTile;
+  const float u = static_cast<float>(x0), v = static_cast<float>(y0);
+  clear(&buffer, false);
+  uint64_t live = cells_inside(view.width - x0, view.height - y0);
+  blend_keys<false>(splats, keys, n, u, v, live, &batch, &buffer);
+  start_backward(view, x0, y0, live, images, d, &buffer);
+  for (int64_t start = 0; start < n; start += kBackwardBatch) {
+    const int size = static_cast<int>(n - start < kBackwardBatch ? n - start : kBackwardBatch);
+    std::memset(&sums, 0, sizeof(sums));
+    if (live) {
+      const int padded = stage(splats, keys + start, n - start, size, u, v, &batch);
+      live &= ~for_each_cell(&batch, padded, live, [&](int row, int column, int count) {
+        return backward_cell(batch, count, u + kCell * column, v + kCell * row,
+                             buffer.cell[8 * row + column][0], &sums);
+      });
+    }
+    for (int i = 0; i < size; ++i) {
+      gradients[start + i] =
+          gather_sums(splats[static_cast<uint32_t>(keys[start + i])], sums.sum[i]);
+    }
+  }
+}
+
 }  // namespace
 
 extern const Kernel IGAUSSIAN_KERNEL;
-const Kernel IGAUSSIAN_KERNEL = {IGAUSSIAN_KERNEL_NAME, kHalfSh, project, blend};
+const Kernel IGAUSSIAN_KERNEL = {IGAUSSIAN_KERNEL_NAME, kHalfSh, project, blend, blend_backward};
 
 }  // namespace igaussian

@@ -194,11 +194,20 @@ void sort_keys(uint64_t* keys, uint64_t* spare, size_t n) {
 
 class Renderer {
  public:
-  Renderer(Model* model, const Kernel& kernel) : model_(model), kernel_(kernel) {}
-  ~Renderer() { free_model(model_); }
+  Renderer(std::shared_ptr<const Model> model, const Kernel& kernel)
+      : model_(std::move(model)), kernel_(kernel) {}
   void render(Frame* frame);
+  void render_batch(Frame* frames, int count, int threads);
+  void backward(Frame* frame, const Gaussians& gaussians, Gradients* gradients);
 
  private:
+  template <class Job>
+  void run(int threads, Job job);
+  void project_all(Frame* frame, const View& view);
+  void blend_backward(int thread, const View& view, const Images& images,
+                      const ImageGradients& gradients);
+  void add_up(int thread, int threads);
+
   void prepare(const Frame& frame);
   void project(int thread, const View& view);
   size_t count_keys(int tile) const;
@@ -206,13 +215,18 @@ class Renderer {
   void blend(int thread, const View& view, const Images& images);
   Pool& pool(int threads);
 
-  Model* model_;
+  std::shared_ptr<const Model> model_;
   const Kernel& kernel_;
+  std::vector<std::unique_ptr<Renderer>> lanes_;  // of render_batch, one for each thread
   std::unique_ptr<Pool> pool_;
   pid_t pool_process_ = 0;
   std::vector<std::unique_ptr<Worker>> workers_;
   std::vector<int32_t> seen_;
   Buffer<Splat> splats_;
+  // of a backward pass: (Gaussian, tile) pairs tile by tile, and where each tile's begin
+  std::vector<size_t> entry_starts_;
+  Buffer<uint32_t> entry_splats_;
+  Buffer<SplatGradient> entry_gradients_, splat_gradients_;
   std::atomic<int> next_{0};
   int tiles_x_ = 0, tiles_y_ = 0;
 };
@@ -308,35 +322,42 @@ void Renderer::blend(int thread, const View& view, const Images& images) {
   }
 }
 
-void Renderer::render(Frame* frame) {
+// job(thread) on each thread, with next_ counting from 0.
+template <class Job>
+void Renderer::run(int threads, Job job) {
+  next_ = 0;
+  std::atomic<bool> failed{false};
+  pool(threads).run([&](int thread) {
+    try {
+      job(thread);
+    } catch (const std::bad_alloc&) {
+      failed = true;
+    }
+  });
+  if (failed) throw std::bad_alloc();
+}
+
+void Renderer::project_all(Frame* frame, const View& view) {
   frame->threads = std::max(1, std::min(frame->threads, kMaxThreads));
-  const View view = make_view(*frame);
   prepare(*frame);
   cull(*model_, view, &seen_);
   splats_.at_least(seen_.size() * kSuperBlock);
-  Pool& threads = pool(frame->threads);
-  std::atomic<bool> failed{false};
-  const auto guarded = [&](auto&& job) {
-    next_ = 0;
-    threads.run([&](int thread) {
-      try {
-        job(thread);
-      } catch (const std::bad_alloc&) {
-        failed = true;
-      }
-    });
-  };
-  guarded([&](int thread) { project(thread, view); });
-  for (const auto& worker : workers_) failed = failed || worker->bins.out_of_memory;
-  if (failed) throw std::bad_alloc();
-  const Images images = {frame->rgb,
-                         frame->depth,
-                         frame->alpha,
-                         frame->median_depth,
-                         frame->ids,
-                         {frame->background[0], frame->background[1], frame->background[2]}};
-  guarded([&](int thread) { blend(thread, view, images); });
-  if (failed) throw std::bad_alloc();
+  run(frame->threads, [&](int thread) { project(thread, view); });
+  for (const auto& worker : workers_) {
+    if (worker->bins.out_of_memory) throw std::bad_alloc();
+  }
+}
+
+Images images_of(const Frame& f) {
+  return {f.rgb, f.depth, f.alpha, f.median_depth, f.ids,
+          {f.background[0], f.background[1], f.background[2]}};
+}
+
+void Renderer::render(Frame* frame) {
+  const View view = make_view(*frame);
+  project_all(frame, view);
+  const Images images = images_of(*frame);
+  run(frame->threads, [&](int thread) { blend(thread, view, images); });
   std::fill(frame->nanoseconds, frame->nanoseconds + 3, 0);
   frame->visible = frame->entries = frame->cells = 0;
   for (const auto& worker : workers_) {
@@ -345,6 +366,96 @@ void Renderer::render(Frame* frame) {
     frame->entries += worker->bins.entries;
     frame->cells += worker->cells;
   }
+}
+
+// Small views: a thread for each view, not for each part of a view.
+void Renderer::render_batch(Frame* frames, int count, int threads) {
+  threads = std::max(1, std::min(std::min(threads, count), kMaxThreads));
+  while (lanes_.size() < static_cast<size_t>(threads)) {
+    lanes_.push_back(std::make_unique<Renderer>(model_, kernel_));
+  }
+  run(threads, [&](int thread) {
+    for (;;) {
+      const int i = next_.fetch_add(1, std::memory_order_relaxed);
+      if (i >= count) break;
+      frames[i].threads = 1;
+      lanes_[thread]->render(&frames[i]);
+    }
+  });
+}
+
+void Renderer::blend_backward(int thread, const View& view, const Images& images,
+                              const ImageGradients& gradients) {
+  Worker& worker = *workers_[thread];
+  const int tiles = tiles_x_ * tiles_y_;
+  for (;;) {
+    const int tile = next_.fetch_add(1, std::memory_order_relaxed);
+    if (tile >= tiles) break;
+    const size_t start = entry_starts_[tile], n = entry_starts_[tile + 1] - start;
+    if (n == 0) continue;
+    uint64_t* keys = worker.keys.at_least(n);
+    uint64_t* spare = worker.spare.at_least(n);
+    gather_keys(tile, keys);
+    sort_keys(keys, spare, n);
+    for (size_t i = 0; i < n; ++i) {
+      entry_splats_.data()[start + i] = static_cast<uint32_t>(keys[i]);
+    }
+    kernel_.blend_backward(view, splats_.data(), keys, static_cast<int64_t>(n), tile % tiles_x_,
+                           tile / tiles_x_, images, gradients, entry_gradients_.data() + start);
+  }
+}
+
+// Sums the entries of this thread's share of the splats, in the order of the tiles: the result
+// does not depend on the number of threads.
+void Renderer::add_up(int thread, int threads) {
+  const size_t splats = seen_.size() * kSuperBlock;
+  const size_t first = splats * thread / threads, last = splats * (thread + 1) / threads;
+  SplatGradient* sums = splat_gradients_.data();
+  std::fill(sums + first, sums + last, SplatGradient{});
+  const size_t entries = entry_starts_.back();
+  for (size_t i = 0; i < entries; ++i) {
+    const uint32_t splat = entry_splats_.data()[i];
+    if (splat < first || splat >= last) continue;
+    const float* from = &entry_gradients_.data()[i].u;
+    float* to = &sums[splat].u;
+    for (size_t k = 0; k < sizeof(SplatGradient) / sizeof(float); ++k) to[k] += from[k];
+  }
+}
+
+void Renderer::backward(Frame* frame, const Gaussians& gaussians, Gradients* gradients) {
+  const View view = make_view(*frame);
+  project_all(frame, view);
+  const int tiles = tiles_x_ * tiles_y_;
+  entry_starts_.assign(tiles + 1, 0);
+  for (int tile = 0; tile < tiles; ++tile) {
+    entry_starts_[tile + 1] = entry_starts_[tile] + count_keys(tile);
+  }
+  const size_t entries = entry_starts_.back(), splats = seen_.size() * kSuperBlock;
+  entry_splats_.at_least(entries);
+  entry_gradients_.at_least(entries);
+  splat_gradients_.at_least(splats);
+  const Images images = images_of(*frame);
+  const ImageGradients by_images = {gradients->rgb, gradients->depth, gradients->alpha};
+  run(frame->threads, [&](int thread) { blend_backward(thread, view, images, by_images); });
+  run(frame->threads, [&](int thread) { add_up(thread, frame->threads); });
+
+  // one sum by the camera for each super block, added in order
+  std::vector<double> by_camera(seen_.size() * 12, 0.0);
+  std::vector<uint8_t> drawn(splats, 0);
+  for (size_t i = 0; i < entries; ++i) drawn[entry_splats_.data()[i]] = 1;
+  run(frame->threads, [&](int) {
+    for (;;) {
+      const size_t block = static_cast<size_t>(next_.fetch_add(1, std::memory_order_relaxed));
+      if (block >= seen_.size()) break;
+      for (size_t i = block * kSuperBlock; i < (block + 1) * kSuperBlock; ++i) {
+        if (!drawn[i]) continue;
+        chain_rule(gaussians, view, model_->antialiased, splats_.data()[i].index,
+                   splat_gradients_.data()[i], *gradients, &by_camera[block * 12]);
+      }
+    }
+  });
+  std::fill(gradients->T_cam_scene, gradients->T_cam_scene + 16, 0.0);
+  for (size_t i = 0; i < by_camera.size(); ++i) gradients->T_cam_scene[i % 12] += by_camera[i];
 }
 
 namespace {
@@ -372,7 +483,7 @@ using namespace igaussian;
 
 #define IGAUSSIAN_API extern "C" __attribute__((visibility("default")))
 
-IGAUSSIAN_API int igaussian_abi() { return 1; }
+IGAUSSIAN_API int igaussian_abi() { return 2; }
 
 // 1 where this CPU runs the instruction set "avx512", "avx2" or "portable".
 IGAUSSIAN_API int igaussian_supports(const char* simd) { return find_kernel(simd) != nullptr; }
@@ -381,8 +492,13 @@ IGAUSSIAN_API void* igaussian_create(const Gaussians* gaussians, int antialiased
                                      const char* simd) {
   const Kernel* kernel = find_kernel(simd);
   if (!kernel) return nullptr;
-  Model* model = pack_model(*gaussians, antialiased != 0, kernel->half_sh);
-  return model ? new (std::nothrow) Renderer(model, *kernel) : nullptr;
+  try {
+    std::shared_ptr<const Model> model(pack_model(*gaussians, antialiased != 0, kernel->half_sh),
+                                       [](const Model* m) { free_model(const_cast<Model*>(m)); });
+    return model ? new Renderer(std::move(model), *kernel) : nullptr;
+  } catch (const std::bad_alloc&) {
+    return nullptr;
+  }
 }
 
 IGAUSSIAN_API void igaussian_destroy(void* renderer) { delete static_cast<Renderer*>(renderer); }
@@ -390,6 +506,26 @@ IGAUSSIAN_API void igaussian_destroy(void* renderer) { delete static_cast<Render
 IGAUSSIAN_API int igaussian_render(void* renderer, Frame* frame) {
   try {
     static_cast<Renderer*>(renderer)->render(frame);
+    return kOk;
+  } catch (...) {
+    return kOutOfMemory;
+  }
+}
+
+IGAUSSIAN_API int igaussian_render_batch(void* renderer, Frame* frames, int count, int threads) {
+  try {
+    static_cast<Renderer*>(renderer)->render_batch(frames, count, threads);
+    return kOk;
+  } catch (...) {
+    return kOutOfMemory;
+  }
+}
+
+// Gradients of a loss by the Gaussians (those the renderer was made of) and by the camera.
+IGAUSSIAN_API int igaussian_backward(void* renderer, Frame* frame, const Gaussians* gaussians,
+                                     Gradients* gradients) {
+  try {
+    static_cast<Renderer*>(renderer)->backward(frame, *gaussians, gradients);
     return kOk;
   } catch (...) {
     return kOutOfMemory;

@@ -1,5 +1,5 @@
 #pragma once
-#include "model.h"
+#include "gradient.h"
 
 namespace igaussian {
 

@@ -84,6 +84,12 @@ struct alignas(64) Splat {
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
 
+// Gradient of the loss by a Splat's members.
+struct SplatGradient {
+  float u, v, along, shear, across, log_opacity;
+  float rgb[3], z;
+};
+
 struct Chunk {
   static constexpr int kKeys = 63;
   uint64_t keys[kKeys];  // depth bits << 32 | splat number
@@ -151,6 +157,11 @@ struct Images {
   float background[3];
 };
 
+// Gradients of the loss by a tile's images; null where it does not depend on one.
+struct ImageGradients {
+  const float *rgb, *depth, *alpha;
+};
+
 // The functions of one instruction set.
 struct Kernel {
   const char* name;
@@ -162,6 +173,9 @@ struct Kernel {
   // Blends one tile front to back; keys are sorted. Returns the number of cells evaluated.
   int64_t (*blend)(const View&, const Splat*, const uint64_t* keys, int64_t n, int tile_x,
                    int tile_y, const Images&);
+  // Gradients by the tile's Gaussians, one for each key.
+  void (*blend_backward)(const View&, const Splat*, const uint64_t* keys, int64_t n, int tile_x,
+                         int tile_y, const Images&, const ImageGradients&, SplatGradient*);
 };
 
 extern const Kernel kPortableKernel;
