@@ -59,8 +59,9 @@ class LocalizerNode(Node):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("localizer", **node_arguments)
         self._settings = parameters.declare(self)
-        self._warn = Throttle(self.get_logger().warning)
-        self._error = Throttle(self.get_logger().error)
+        # rclpy ties a severity to the calling line: one lambda, one line, one severity
+        self._warn = Throttle(lambda text: self.get_logger().warning(text))
+        self._error = Throttle(lambda text: self.get_logger().error(text))
         for line in parameters.unknown_parameters(self):
             self.get_logger().warning(line)
         cv2.setNumThreads(self._settings.config.runtime.threads)
@@ -653,7 +654,7 @@ def _check_map_path(node: LocalizerNode, run: _Run) -> None:
 
 def _spin(executor: SingleThreadedExecutor, node: LocalizerNode, run: _Run) -> None:
     """Callbacks until the run is over; an error in one does not end the node."""
-    guard = Throttle(node.get_logger().error)
+    guard = Throttle(lambda text: node.get_logger().error(text))
     while not run.over.is_set():
         try:
             # Python sees signals between two calls only

@@ -51,7 +51,8 @@ class Options:
         remap: new names by old.
         raw: publish compressed images decoded, on their topic without /compressed.
         stamp_now: move header stamps to the present by a constant, and publish no /clock.
-        wait_s: how long to wait until every image topic has a subscriber.
+        wait_s: how long to wait until every image topic (every topic, where no image is
+            replayed) has a subscriber.
         clock_hz: /clock messages a second of wall time.
     """
 
@@ -149,19 +150,16 @@ class Replayer:
         return Channel(publisher, kind, decode, is_stamped(kind))
 
     def _wait_for_subscribers(self) -> None:
-        images = [
-            self._channels[name].publisher
-            for name in self._bag.topics_of(*_IMAGES)
-            if name in self._channels
-        ]
+        images = [name for name in self._bag.topics_of(*_IMAGES) if name in self._channels]
+        awaited = [self._channels[name].publisher for name in images or self._channels]
         end = time.monotonic() + self._options.wait_s
         while time.monotonic() < end and not self._over.is_set():
-            if all(publisher.get_subscription_count() > 0 for publisher in images):
+            if all(publisher.get_subscription_count() > 0 for publisher in awaited):
                 self._over.wait(0.3)  # the other side has to match, too
                 return
             self._over.wait(0.02)
         if self._options.wait_s > 0 and not self._over.is_set():
-            names = ", ".join(publisher.topic_name for publisher in images)
+            names = ", ".join(publisher.topic_name for publisher in awaited)
             self._node.get_logger().warning(
                 f"no subscriber of {names} within {self._options.wait_s:g} s; starting all the same"
             )

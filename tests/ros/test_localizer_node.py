@@ -38,6 +38,7 @@ from igaussian_ros.convert import (
 )
 from igaussian_ros.diagnostics import OUTCOMES
 from igaussian_ros.listener import Listener
+from igaussian_ros.localizer_node import LocalizerNode
 
 MAX_ERROR = (1.0, 0.08)  # degrees, metres: the Gaussians of the test scene are coarse
 
@@ -317,11 +318,11 @@ def test_two_loads_at_a_time_are_one_too_many(camera):
 
 
 def test_read_only_parameters_are_refused_with_a_reason(camera):
-    result = _set(camera, "refine.rounds", 2)
+    result = _set(camera, "runtime.threads", 3)
     assert not result.successful and "read-only" in result.reason
-    request = GetParameters.Request(names=["refine.rounds", "runtime.threads"])
-    values = call(camera, GetParameters, "/localizer/get_parameters", request).values
-    assert [v.integer_value for v in values] == [3, 2]
+    request = GetParameters.Request(names=["runtime.threads"])
+    (value,) = call(camera, GetParameters, "/localizer/get_parameters", request).values
+    assert value.integer_value == 2
 
 
 def test_every_received_image_is_accounted_for(camera, photo, corner):
@@ -340,10 +341,14 @@ def test_every_received_image_is_accounted_for(camera, photo, corner):
 
     def settled():
         counts = camera.counts()
-        return counts["received"] == 15 == sum(counts[name] for name in OUTCOMES)
+        return counts["received"] == sum(counts[name] for name in OUTCOMES)
 
+    time.sleep(1)
     assert wait_until(settled, 15), camera.diagnostics
     counts = camera.counts()
+    # of images that arrive faster than they are taken, best effort keeps the last
+    assert 8 <= counts["received"] <= 15
+    assert counts["rejected"] <= 1 and counts["failed"] == counts["stale"] == 0
     assert counts["dropped"] >= 1 and counts["localized"] >= 2
     assert counts["throttled"] >= 1
     assert counts["processed"] == counts["localized"] + counts["lost"]
@@ -374,6 +379,33 @@ def test_the_overlay_shows_live_and_render(camera, photo, corner):
     difference = np.abs(right - photo[:, 250:])
     assert 0 < np.median(difference) < 25  # drawn from Gaussians, at the same pose
     camera.destroy_subscription(subscription)
+
+
+def test_a_defect_in_one_frame_ends_neither_node_nor_stream(ros, corner, monkeypatch, capfd):
+    overrides = [Parameter("map_path", value=str(corner.map_path))]
+    node = LocalizerNode(parameter_overrides=overrides, namespace="fragile")
+    with Spinning(Listener("/fragile/localizer", None, "witness")) as witness, Spinning(node):
+        try:
+            assert wait_until(lambda: node.count_subscribers("/fragile/localizer/status") == 1)
+            time.sleep(0.3)
+            node._warn("key", "a warning before the error")
+
+            def break_down(message, now_ns):
+                raise ZeroDivisionError("something nobody thought of")
+
+            monkeypatch.setattr(node._pipeline, "process", break_down)
+            for stamp_ns in (1, 2):
+                node._on_image(image_to_ros(np.zeros((2, 2, 3), np.uint8), header(stamp_ns)))
+                assert node._worker.drain(5)
+            assert wait_until(lambda: len(witness.statuses) == 2)
+            assert witness.statuses[1].values == {
+                "status": "failed", "reason": "ZeroDivisionError: something nobody thought of"
+            }  # fmt: skip
+            assert node._counters.snapshot()["failed"] == 2
+        finally:
+            assert node.stop()
+    log = capfd.readouterr().err
+    assert log.count("a frame failed: something nobody thought of") == 1 and "Traceback" in log
 
 
 # --- processes of their own ---
@@ -439,13 +471,13 @@ def test_a_signal_while_the_map_is_loading_ends_the_node(ros, corner, tmp_path):
 def test_silence_is_explained(ros, corner, tmp_path):
     with Spinning(Node("lossy_camera")) as camera, node_process(
         tmp_path, "/front/image:=/rear/image", map_path=corner.map_path, use_sim_time=True,
-        no_data_warning_s=0.5, image_topic="front/image", image_qos="reliable", refine__round=2,
-        publish_tf=True,
+        no_data_warning_s=0.5, image_topic="front/image", image_qos="reliable",
+        camera_info_topic="info", runtime__thread=2, publish_tf=True,
     ) as node:  # fmt: skip
         assert node.says("use_sim_time is set, but nothing is heard on /clock", 30), node.log
         assert node.says("/rear/image has 0 publishers, 0 images received", 10), node.log
-        assert "/camera/camera_info has 0 publishers" in node.log
-        assert "did you mean 'refine.rounds'?" in node.log
+        assert "/info has 0 publishers" in node.log
+        assert "did you mean 'runtime.threads'?" in node.log
         there = importlib.util.find_spec("tf2_msgs") is not None
         assert ("tf2_msgs is not installed" in node.log) != there
         camera.create_publisher(Image, "/rear/image", qos_profile_sensor_data)
@@ -460,7 +492,7 @@ def test_silence_is_explained(ros, corner, tmp_path):
         ({}, "parameter map_path is empty"),
         ({"map_path": "/no/such.igmap"}, "/no/such.igmap does not exist"),
         ({"map_path": "."}, "no compiled map"),
-        ({"map_path": ".", "refine__rounds": 99}, "refine.rounds=99 is outside [1, 8]"),
+        ({"map_path": ".", "runtime__threads": 0}, "runtime.threads=0 is outside [1, 256]"),
     ],
 )
 def test_what_cannot_start_says_why_and_ends_with_status_1(ros, tmp_path, parameters, text):

@@ -65,10 +65,10 @@ def test_every_option_of_the_core_is_a_parameter_with_description_and_range(decl
 
 
 def test_values_given_at_start_reach_the_config(declared):
-    node, settings = declared(refine__rounds=2, tracking__enabled=False, map_frame="hall")
-    assert (settings.config.refine.rounds, settings.config.tracking.enabled) == (2, False)
+    node, settings = declared(runtime__threads=3, tracking__enabled=False, map_frame="hall")
+    assert (settings.config.runtime.threads, settings.config.tracking.enabled) == (3, False)
     assert settings["map_frame"] == "hall"
-    assert node.get_parameter("refine.rounds").value == 2
+    assert node.get_parameter("runtime.threads").value == 3
 
 
 def test_an_integer_serves_where_a_float_is_meant(declared):
@@ -80,9 +80,9 @@ def test_an_integer_serves_where_a_float_is_meant(declared):
 @pytest.mark.parametrize(
     ("given", "text"),
     [
-        ({"refine__rounds": 99}, r"refine.rounds=99 is outside \[1, 8\]"),
-        ({"refine__rounds": 2.5}, "refine.rounds must be of type int, got float 2.5"),
-        ({"refine__rounds": True}, "refine.rounds must be of type int"),
+        ({"runtime__threads": 999}, r"runtime.threads=999 is outside \[1, 256\]"),
+        ({"runtime__threads": 2.5}, "runtime.threads must be of type int, got float 2.5"),
+        ({"runtime__threads": True}, "runtime.threads must be of type int"),
         ({"image_transport": "h264"}, "'h264' is none of raw, compressed"),
         ({"map_path": 5}, "map_path must be of type str"),
         ({"map_frame": ""}, "map_frame must not be empty"),
@@ -109,7 +109,7 @@ def test_base_to_camera_is_a_transform_or_nothing(declared):
 
 def test_read_only_parameters_cannot_be_changed_at_run_time(declared):
     node, _ = declared()
-    for name, value in (("refine.rounds", 2), ("map_frame", "x"), ("publish_tf", True)):
+    for name, value in (("runtime.threads", 3), ("map_frame", "x"), ("publish_tf", True)):
         result = node.set_parameters([Parameter(name, value=value)])[0]
         assert not result.successful
         assert "read-only" in result.reason and name in result.reason
@@ -127,9 +127,9 @@ def test_changeable_parameters_are_checked(declared):
 
 
 def test_a_mistyped_name_is_pointed_out(declared):
-    node, _ = declared(refine__round=2, use_sim_time=False)
+    node, _ = declared(runtime__thread=2, use_sim_time=False)
     assert parameters.unknown_parameters(node) == [
-        "parameter 'refine.round' is unknown and ignored; did you mean 'refine.rounds'?"
+        "parameter 'runtime.thread' is unknown and ignored; did you mean 'runtime.threads'?"
     ]
 
 

@@ -63,8 +63,8 @@ def test_a_recording_arrives_complete_with_its_clock(ros, corner, tmp_path):
 def test_bytes_are_those_recorded(ros, corner, tmp_path):
     ear = Ear(camera__camera_info=CameraInfo)
     with Spinning(ear), replay_process(
-        tmp_path, corner.bag, "--rate", "20", "--topics", "/camera/camera_info",
-        "--wait-for-subscribers", "1",
+        tmp_path, corner.bag, "--rate", "4", "--topics", "/camera/camera_info",
+        "--wait-for-subscribers", "10",
     ) as player:  # fmt: skip
         assert player.popen.wait(30) == 0, player.log
         assert wait_until(lambda: len(ear.heard["/camera/camera_info"]) == 40, 5)
