@@ -83,7 +83,8 @@ def overview(
 
 
 def kind_of(gmap: GaussianMap) -> str:
-    """"scene" where the Gaussians' sizes point at a place that they were seen from.
+    """"scene" where the Gaussians' sizes point at a place that they were seen from, or where
+    they are the floor, the ceiling and the walls of a box; else "object".
 
     Raises:
         MapError: the map is empty.
@@ -93,7 +94,7 @@ def kind_of(gmap: GaussianMap) -> str:
         high - low
     )
     best = float(size_distance_correlation(gmap, positions, low, high).max())
-    return "scene" if best > _SCENE_CORRELATION else "object"
+    return "scene" if best > _SCENE_CORRELATION or _is_hollow(gmap, low, high) else "object"
 
 
 def likely_up(gmap: GaussianMap, kind: str) -> UpAxis:
@@ -137,6 +138,24 @@ def orbit(kind: str, T_scene_cam: Array, target: Array, up: Array, count: int) -
     return np.array([look_at(p, target, up) for p in positions])
 
 
+def _is_hollow(gmap: GaussianMap, low: Array, high: Array) -> bool:
+    """A room: most Gaussians lie at the bounding box's sides, and the middle is free."""
+    unit = (gmap.means - low) / np.maximum(high - low, 1e-12)
+    at_side = (np.minimum(unit, 1 - unit).min(axis=1) < 0.05)[gmap.opacities > 0.1]
+    if at_side.size == 0 or at_side.mean() < 0.6:
+        return False
+    cube = Camera(48, 48, 24.0, 24.0, 23.5, 23.5)
+    centre, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
+    depths, alphas = [], []
+    for direction in (*np.eye(3), *-np.eye(3)):
+        T = look_at(centre, centre + direction)
+        _, depth, alpha = gmap.render(cube, inverse(T))
+        depths.append(depth)
+        alphas.append(alpha)
+    solid = np.array(alphas) > 0.5
+    return bool(solid.mean() > 0.8 and np.median(np.array(depths)[solid]) > 0.12 * size)
+
+
 def _camera_of(width: int, height: int) -> Camera:
     focal = 0.5 * max(width, height) / np.tan(np.radians(65) / 2)
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
@@ -174,7 +193,9 @@ def _ground(gmap: GaussianMap, low: Array, high: Array, up: Array) -> float:
     order = np.sort(gmap.scales, axis=1)
     axis = int(np.argmax(np.abs(up)))
     flat = (order[:, 0] < 0.5 * order[:, 1]) & (gmap.opacities > 0.3)
-    flat &= ((gmap.means > low) & (gmap.means < high)).all(axis=1)
+    # a flat ground may lie exactly at the lowest percentile
+    margin = 1e-3 * (high - low)
+    flat &= ((gmap.means > low - margin) & (gmap.means < high + margin)).all(axis=1)
     if not flat.any():
         return 0.0
     area = order[flat, 1] * order[flat, 2]
@@ -216,13 +237,16 @@ def _best_scene_view(
     """Of poses where the training cameras probably were, the one whose small render is clearest."""
     rng = np.random.default_rng(0)
     likely = likely_camera_positions(gmap, low, high, samples=1500)
-    positions = [np.median(likely, axis=0), *likely[:: max(1, len(likely) // 11)]]
-    positions.append(np.zeros(3))  # where the first camera of many trackers stood
+    positions: list[Array] = [np.median(likely, axis=0), *likely[:: max(1, len(likely) // 11)]]
+    # the middle of a room, and where the first camera of many trackers stood
+    positions += [0.5 * (low + high), np.zeros(3)]
     small = camera.scaled_to_fit(128)
     best, best_score = look_at(positions[0], 0.5 * (low + high), up), -1.0
     for position in positions:
         targets = low + (0.25 + 0.5 * rng.random((3, 3))) * (high - low)
         for target in (0.5 * (low + high), *targets):
+            if np.allclose(target, position):
+                continue
             T = look_at(position, target, up)
             score = _clarity(gmap, small, T, 0.06 * float(np.linalg.norm(high - low)))
             if score > best_score:

@@ -86,9 +86,12 @@ def _gunzip(file: Path, data: bytes) -> bytes:
             return head
         header = _legacy_header(file, head, len(data))
         wanted = sum(header.sizes()) + _MOST_EXTENSION_BYTES
-        return head + stream.decompress(stream.unconsumed_tail, wanted)
+        data = head + stream.decompress(stream.unconsumed_tail, wanted)
     except zlib.error as error:
         raise MapError(f"{file}: damaged gzip stream: {error}") from error
+    if not stream.eof:  # reached only with the right checksum
+        raise MapError(f"{file}: truncated .spz, or longer than its header declares")
+    return data
 
 
 def _check(file: Path, header: _Header, stored_bytes: int) -> _Header:
@@ -175,7 +178,7 @@ def _decode(
     count = header.count
     sh = np.empty((count, 1 + _SH_VALUES[header.degree] // 3, 3), np.float32)
     sh[:, 0] = (colours.reshape(-1, 3).astype(np.float32) / 255 - 0.5) / _COLOUR_SCALE
-    sh[:, 1:] = (harmonics.reshape(count, -1, 3).astype(np.float32) - 128) / 128
+    sh[:, 1:] = (harmonics.reshape(count, sh.shape[1] - 1, 3).astype(np.float32) - 128) / 128
     if header.degree == 4:
         log.warning("%s: spherical harmonics of degree 4 are cut to degree 3", file)
         sh = np.ascontiguousarray(sh[:, :16])
