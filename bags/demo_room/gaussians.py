@@ -141,6 +141,8 @@ def _visible(room: Room, surface: Surface, rows: int, cols: int) -> NDArray[np.b
     visible &= np.all((points > 0) & (points < [room.width, room.depth, room.height]), -1)
     low, high = points.min((0, 1)), points.max((0, 1))
     for solid in room.solids:
+        if not solid.opaque:
+            continue
         reach = (np.abs(solid.axes) * solid.half[:, None]).sum(0)
         if np.all(solid.centre + reach >= low) and np.all(solid.centre - reach <= high):
             visible &= ~solid.contains(points)

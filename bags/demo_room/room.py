@@ -94,7 +94,8 @@ def _panel(
     surface = room.surfaces[-1]
     centre = surface.points(np.array(0.5), np.array(0.5)) - surface.normal * thick / 2
     axes = np.array([right, surface.normal, z])
-    room.solids.append(Solid(centre, axes, np.array([width, thick, height]) / 2))
+    half = np.array([width, thick, height]) / 2
+    room.solids.append(Solid(centre, axes, half, opaque=surface.mask is None))
 
 
 # ---------------------------------------------------------------- along the walls

@@ -80,11 +80,15 @@ class Surface:
 
 @dataclass(frozen=True)
 class Solid:
-    """An upright box that hides what lies inside it; axes [3, 3] are its rows."""
+    """An upright box that hides what lies inside it; axes [3, 3] are its rows.
+
+    Not opaque: its face has a mask, so that what lies inside is in the dark but partly seen.
+    """
 
     centre: Array
     axes: Array
     half: Array
+    opaque: bool = True
 
     def contains(self, points: Array, margin: float = 0.0) -> NDArray[np.bool_]:
         """Which of points [..., 3] lie inside the box grown by margin metres."""
