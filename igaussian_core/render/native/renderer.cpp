@@ -196,6 +196,7 @@ class Renderer {
  public:
   Renderer(std::shared_ptr<const Model> model, const Kernel& kernel)
       : model_(std::move(model)), kernel_(kernel) {}
+  ~Renderer() { forget_lost_threads(); }
   void render(Frame* frame);
   void render_batch(Frame* frames, int count, int threads);
   void backward(Frame* frame, const Gaussians& gaussians, Gradients* gradients);
@@ -214,6 +215,7 @@ class Renderer {
   void gather_keys(int tile, uint64_t* keys);
   void blend(int thread, const View& view, const Images& images);
   Pool& pool(int threads);
+  void forget_lost_threads();
 
   std::shared_ptr<const Model> model_;
   const Kernel& kernel_;
@@ -231,9 +233,13 @@ class Renderer {
   int tiles_x_ = 0, tiles_y_ = 0;
 };
 
-Pool& Renderer::pool(int threads) {
-  // threads do not survive a fork; the old pool's memory is given up in the child
+// Threads do not survive a fork: in the child the pool cannot be joined, its memory is given up.
+void Renderer::forget_lost_threads() {
   if (pool_ && pool_process_ != getpid()) (void)pool_.release();
+}
+
+Pool& Renderer::pool(int threads) {
+  forget_lost_threads();
   if (!pool_ || pool_->workers() != threads - 1) {
     pool_.reset();
     pool_ = std::make_unique<Pool>(threads - 1);
