@@ -68,10 +68,18 @@ class CoarseConfig:
 class RefineConfig:
     """Stage two: match the image with a render at the hypothesis, PnP with rendered depth."""
 
-    rounds: int = _option(3, "most renders a hypothesis gets", 1, 8)
-    converged_deg: float = _option(1.0, "a rotation step below this needs no new render", 0, 45)
-    converged_rel: float = _option(
-        0.03, "a translation step below this share of the median depth needs no new render", 0, 1
+    align_points: int = _option(400, "points of a render that are followed into the image", 16, 4096)
+    align_window: int = _option(15, "side in pixels of the patches that are followed", 5, 51)
+    align_levels: int = _option(
+        2, "pyramid levels of following: 2 finds points about 15 pixels off", 0, 5
+    )
+    align_rounds: int = _option(3, "most renders one alignment gets", 1, 8)
+    rounds: int = _option(2, "most renders matched by descriptors", 1, 8)
+    converged_px: float = _option(
+        0.5, "image motion in pixels of a step below which no new render is made", 0.01, 16
+    )
+    moved_px: float = _option(
+        25.0, "image motion of a step above which descriptors are matched again", 1, 500
     )
     max_reprojection_px: float = _option(3.0, "inlier threshold of PnP in pixels", 0.25, 32)
     min_alpha: float = _option(0.8, "least alpha of a render's pixel that is lifted to 3D", 0, 1)
@@ -93,6 +101,8 @@ class RefineConfig:
 class VerifyConfig:
     """What a pose must show to be accepted; fixed from held-out photos, see docs/accuracy.md."""
 
+    min_inliers_align: int = _option(60, "least PnP inliers of followed points", 4, 1000)
+    min_ratio_align: float = _option(0.4, "least share of followed points that agree", 0, 1)
     min_inliers_xfeat: int = _option(40, "least PnP inliers with XFeat + LighterGlue", 4, 1000)
     min_ratio_xfeat: float = _option(0.35, "least inlier ratio with XFeat + LighterGlue", 0, 1)
     min_inliers_sift: int = _option(25, "least PnP inliers with SIFT", 4, 1000)

@@ -14,10 +14,11 @@ from igaussian_core.camera import Camera
 from igaussian_core.coarse.landmarks import LandmarkLocalizer
 from igaussian_core.config import Config
 from igaussian_core.errors import CameraError, MapError
-from igaussian_core.features import Features, Matcher, make_matcher
+from igaussian_core.features import Matcher, make_matcher
 from igaussian_core.geometry import Sim3, is_rigid
 from igaussian_core.hypothesis import Hypothesis
 from igaussian_core.map_package import Manifest, MapPackage, open_package
+from igaussian_core.query import Query
 from igaussian_core.refine.refiner import Refinement, Refiner
 from igaussian_core.refine.verify import judge
 from igaussian_core.result import LocalizationResult, Status
@@ -45,8 +46,9 @@ class Localizer:
             package.landmarks, self._config.coarse, self._matcher.min_similarity
         )
         self._refiner = Refiner(
-            self._render_scene, self._matcher, self._config.refine, self._config.features.keypoints
-        )
+            self._render_scene, self._matcher, self._config.features.keypoints,
+            self._config.refine, self._config.verify,
+        )  # fmt: skip
 
     @staticmethod
     def open(path: str | os.PathLike[str], config: Config | None = None) -> Localizer:
@@ -91,14 +93,12 @@ class Localizer:
             return LocalizationResult(
                 Status.TOO_DARK_OR_BLURRED, reason, timings_ms=timer.timings_ms()
             )
-        with timer("extract"):
-            features = self._matcher.extract(image, self._config.features.keypoints)
-
+        query = Query(image, camera, self._matcher, self._config.features.keypoints, timer)
         failure = LocalizationResult(
             Status.NO_HYPOTHESIS, "no place in the map resembles the image", source="landmarks"
         )
-        for hypothesis in self._hypotheses(features, camera, prior, timer):
-            refinement = self._refiner.refine(features, camera, hypothesis.T_scene_cam, timer)
+        for hypothesis in self._hypotheses(query, prior):
+            refinement = self._refiner.refine(query, hypothesis.T_scene_cam)
             result = self._result(hypothesis, refinement)
             if result.ok:
                 return _timed(result, timer)
@@ -127,17 +127,15 @@ class Localizer:
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         return small.undistort(image)
 
-    def _hypotheses(
-        self, features: Features, camera: Camera, prior: ArrayLike | None, timer: StageTimer
-    ) -> Iterator[Hypothesis]:
+    def _hypotheses(self, query: Query, prior: ArrayLike | None) -> Iterator[Hypothesis]:
         """Stage one: the prior, then places that the landmarks know; found as asked for."""
         if prior is not None:
             if not is_rigid(prior):
                 raise CameraError("prior: expected a rigid 4x4 transform T_map_cam")
             yield Hypothesis(self._T_map_scene.inverse().camera(prior), 0.0, "prior")
-        candidates = self._landmarks.hypotheses(features, camera)
+        candidates = self._landmarks.hypotheses(query.features, query.camera)
         while True:
-            with timer("coarse"):
+            with query.timer("coarse"):
                 hypothesis = next(candidates, None)
             if hypothesis is None:
                 return
@@ -145,7 +143,7 @@ class Localizer:
 
     def _result(self, hypothesis: Hypothesis, refinement: Refinement) -> LocalizationResult:
         evidence = refinement.evidence
-        status, reason = judge(evidence, self._matcher.name, self._config.verify)
+        status, reason = judge(evidence, self._config.verify)
         T_map_cam = covariance = None
         if status.ok and refinement.T_scene_cam is not None:
             T_map_cam = self._T_map_scene.camera(refinement.T_scene_cam)
@@ -160,7 +158,7 @@ class Localizer:
             inlier_ratio=evidence.ratio,
             residual_px=evidence.residual_px,
             coverage=evidence.coverage,
-            matcher=self._matcher.name,
+            matcher=evidence.method,
             source=hypothesis.source,
             T_map_cam_coarse=self._T_map_scene.camera(hypothesis.T_scene_cam),
         )

@@ -92,7 +92,7 @@ def pose_covariance(
 
     sigma^2 (J^T J)^-1 of the reprojection errors, with respect to a shift of the camera's
     position and a rotation vector in the scene's axes that turns the estimate; sigma is the
-    residuals' root mean square per coordinate, at least 0.3 px.
+    residuals' root mean square per coordinate, at least 0.1 px.
 
     Args:
         points_scene: inlier points [N, 3], in front of the camera.
@@ -108,7 +108,7 @@ def pose_covariance(
     d_position = np.broadcast_to(-rotation.T, (len(z), 3, 3))
     d_rotation = rotation.T @ skew(offsets)
     J = (d_pixel @ np.concatenate([d_position, d_rotation], axis=2)).reshape(-1, 6)
-    variance = max(float(np.mean(np.square(residuals_px))) / 2, 0.3**2)
+    variance = max(float(np.mean(np.square(residuals_px))) / 2, 0.1**2)
     # units of the translation columns are scaled so that the inverse stays well conditioned
     scale = np.array([1 / np.median(z)] * 3 + [1.0] * 3)
     information = (J / scale).T @ (J / scale) + 1e-9 * np.eye(6)

@@ -38,7 +38,7 @@ class LocalizationResult:
         inlier_ratio: inliers / matches.
         residual_px: median reprojection error of the inliers in pixels.
         coverage: share of the render's pixels that the map covers.
-        matcher: "xfeat" or "sift".
+        matcher: what the deciding correspondences came from: "align", "xfeat", "sift".
         source: where the accepted (or last tried) hypothesis came from.
         T_map_cam_coarse: the best hypothesis before refinement, or None.
         timings_ms: milliseconds by stage, with `total`.

@@ -1,4 +1,4 @@
-"""Render at a hypothesis, match with the image, PnP with the rendered depth, verify."""
+"""From a hypothesis to an exact pose: renders, correspondences, PnP with the rendered depth."""
 
 from __future__ import annotations
 
@@ -9,18 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igaussian_core.camera import Camera
-from igaussian_core.config import RefineConfig
-from igaussian_core.features import Features, Matcher
+from igaussian_core.config import RefineConfig, VerifyConfig
+from igaussian_core.features import Matcher
 from igaussian_core.geometry import inverse, pose_error, transform_points
 from igaussian_core.lifting import at_pixels, sample, trusted_depth, unproject
 from igaussian_core.pnp import pose_covariance, solve_pnp
-from igaussian_core.refine.verify import Evidence
-from igaussian_core.timing import StageTimer
+from igaussian_core.query import Query
+from igaussian_core.contrast import Gray, normalize_contrast
+from igaussian_core.refine.alignment import corners, follow
+from igaussian_core.refine.verify import Evidence, judge
+from igaussian_core.result import Status
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
+Pixels = NDArray[np.float32]
 # (camera, T_scene_cam) -> RGB [H, W, 3], depth [H, W], alpha [H, W]
 RenderFunction = Callable[[Camera, Array], tuple[Image, Image, Image]]
+
+_MIN_COVERAGE = 0.02  # with less there is nothing to match
+_MAX_SUBPIXEL_MOVE_PX = 4.0
 
 
 @dataclass(frozen=True)
@@ -28,7 +35,7 @@ class Refinement:
     """The outcome of stage two for one hypothesis.
 
     Attributes:
-        T_scene_cam: the refined pose; None where no pose fits the matches.
+        T_scene_cam: the refined pose; None where no pose fits the correspondences.
         covariance_scene: [6, 6], scene axes and units; None with the pose.
         evidence: what the verdict rests on.
     """
@@ -38,98 +45,167 @@ class Refinement:
     evidence: Evidence
 
 
+@dataclass(frozen=True)
+class _View:
+    """The map as seen from a hypothesis."""
+
+    image: NDArray[np.uint8]
+    gray: Gray
+    depth: Image
+    trusted: NDArray[np.bool_]
+    coverage: float
+    median_depth: float
+
+
 class Refiner:
     """Refines hypotheses against renders of one map.
 
     Args:
         render: renders the map.
-        matcher: of the frame's features.
-        config: stage two.
-        keypoints: extracted on each render.
+        matcher: of the query's features.
+        keypoints: extracted on each render that is matched by descriptors.
     """
 
     def __init__(
-        self, render: RenderFunction, matcher: Matcher, config: RefineConfig, keypoints: int
+        self,
+        render: RenderFunction,
+        matcher: Matcher,
+        keypoints: int,
+        config: RefineConfig,
+        verify: VerifyConfig,
     ) -> None:
         self._render = render
         self._matcher = matcher
-        self._config = config
         self._keypoints = keypoints
+        self._config = config
+        self._verify = verify
 
-    def refine(
-        self, features: Features, camera: Camera, T_scene_cam: Array, timer: StageTimer
-    ) -> Refinement:
-        """Rounds of render, match and PnP until a round moves the camera little.
+    def refine(self, query: Query, T_scene_cam: Array) -> Refinement:
+        """The pose near a hypothesis, by alignment where that convinces, else by descriptors.
 
-        Each round renders where the last one ended: matches between nearly equal views are
-        many and exact.
+        Alignment costs a fifth of descriptor matching and is the more exact of the two, but
+        only finds poses a few degrees away.
         """
+        aligned = self.align(query, T_scene_cam)
+        if self._status(aligned) is Status.OK:
+            return aligned
+        matched = self.match(query, T_scene_cam)
+        if matched.T_scene_cam is None or not self._status(matched).ok:
+            return matched
+        polished = self.align(query, matched.T_scene_cam)
+        return polished if self._status(polished) is Status.OK else matched
+
+    def align(self, query: Query, T_scene_cam: Array) -> Refinement:
+        """Follow points of the render into the image, PnP, again from there until it rests."""
+        gray = query.gray
+        result = Refinement(None, None, Evidence("align"))
+        for _ in range(self._config.align_rounds):
+            view = self._view(query, T_scene_cam)
+            if view.coverage < _MIN_COVERAGE:
+                return Refinement(None, None, Evidence("align", coverage=view.coverage))
+            with query.timer("align"):
+                uv_render = corners(view.gray, view.trusted, self._config.align_points)
+                uv_image, good = follow(
+                    view.gray, gray, uv_render, uv_render,
+                    self._config.align_window, self._config.align_levels,
+                )  # fmt: skip
+            with query.timer("solve"):
+                result = self._solve(
+                    query, view, T_scene_cam, "align", uv_render[good], uv_image[good],
+                    looked_at=len(uv_render),
+                )  # fmt: skip
+            if result.T_scene_cam is None:
+                return result
+            step_px = _motion_px(query.camera, result.T_scene_cam, T_scene_cam, view.median_depth)
+            T_scene_cam = result.T_scene_cam
+            if step_px < self._config.converged_px:
+                break
+        return result
+
+    def match(self, query: Query, T_scene_cam: Array) -> Refinement:
+        """Match descriptors of image and render, PnP; once more where that moved far."""
+        gray = query.gray
         best: Refinement | None = None
         for _ in range(self._config.rounds):
-            result, depth = self._round(features, camera, T_scene_cam, timer)
+            view = self._view(query, T_scene_cam)
+            result = self._match_once(query, gray, view, T_scene_cam)
             if best is None or result.evidence.inliers >= 0.8 * best.evidence.inliers:
                 best = result
             if result.T_scene_cam is None or best is not result:
                 break
-            angle, distance = pose_error(result.T_scene_cam, T_scene_cam)
+            step_px = _motion_px(query.camera, result.T_scene_cam, T_scene_cam, view.median_depth)
             T_scene_cam = result.T_scene_cam
-            if angle < self._config.converged_deg and distance < self._config.converged_rel * depth:
+            if step_px < self._config.moved_px:
                 break
         assert best is not None
         return best
 
-    def _round(
-        self, features: Features, camera: Camera, T_scene_cam: Array, timer: StageTimer
-    ) -> tuple[Refinement, float]:
-        """One render, match and solve; also the median depth of the render's opaque part."""
-        config = self._config
-        with timer("render"):
-            rgb, depth, alpha = self._render(camera, T_scene_cam)
-            covered = alpha >= config.min_alpha
-            coverage = float(covered.mean())
-            median_depth = float(np.median(depth[covered])) if covered.any() else 0.0
-        if coverage < 0.02:
-            return Refinement(None, None, Evidence(coverage=coverage)), median_depth
-        with timer("extract"):
-            rendered = self._matcher.extract(_to_u8(rgb), self._keypoints)
-        with timer("match"):
+    def _match_once(
+        self, query: Query, gray: Gray, view: _View, T_scene_cam: Array
+    ) -> Refinement:
+        method = self._matcher.name
+        if view.coverage < _MIN_COVERAGE:
+            return Refinement(None, None, Evidence(method, coverage=view.coverage))
+        features = query.features
+        with query.timer("extract"):
+            rendered = self._matcher.extract(view.image, self._keypoints)
+        with query.timer("match"):
             pairs = self._matcher.match(features, rendered)
-        with timer("solve"):
-            trusted = trusted_depth(depth, alpha, config.min_alpha, config.max_depth_step)
-            pairs = pairs[at_pixels(trusted, rendered.uv[pairs[:, 1]])]
-            uv_render = rendered.uv[pairs[:, 1]]
-            points_cam = unproject(camera, uv_render, sample(depth, uv_render))
-            points_scene = transform_points(T_scene_cam, points_cam)
+        with query.timer("align"):
+            pairs = pairs[at_pixels(view.trusted, rendered.uv[pairs[:, 1]])]
+            uv_image, uv_render = features.uv[pairs[:, 0]], rendered.uv[pairs[:, 1]]
+            exact, good = follow(
+                view.gray, gray, uv_render, uv_image, self._config.align_window, levels=0
+            )
+            good &= np.linalg.norm(exact - uv_image, axis=1) < _MAX_SUBPIXEL_MOVE_PX
+            uv_image = np.where(good[:, None], exact, uv_image)
+        with query.timer("solve"):
             return self._solve(
-                camera, features.uv[pairs[:, 0]], points_scene, T_scene_cam, coverage
-            ), median_depth
+                query, view, T_scene_cam, method, uv_render, uv_image, looked_at=len(pairs)
+            )
+
+    def _view(self, query: Query, T_scene_cam: Array) -> _View:
+        with query.timer("render"):
+            config = self._config
+            rgb, depth, alpha = self._render(query.camera, T_scene_cam)
+            covered = alpha >= config.min_alpha
+            image = to_u8(rgb)
+            return _View(
+                image=image,
+                gray=normalize_contrast(image),
+                depth=depth,
+                trusted=trusted_depth(depth, alpha, config.min_alpha, config.max_depth_step),
+                coverage=float(covered.mean()),
+                median_depth=float(np.median(depth[covered])) if covered.any() else 0.0,
+            )
 
     def _solve(
-        self,
-        camera: Camera,
-        uv: NDArray[np.float32],
-        points_scene: Array,
-        T_scene_cam: Array,
-        coverage: float,
-    ) -> Refinement:
+        self, query: Query, view: _View, T_scene_cam: Array, method: str,
+        uv_render: Pixels, uv_image: Pixels, looked_at: int,
+    ) -> Refinement:  # fmt: skip
+        """PnP of the image's pixels with the render's points, and what speaks for it."""
+        camera = query.camera
+        points_cam = unproject(camera, uv_render, sample(view.depth, uv_render))
+        points = transform_points(T_scene_cam, points_cam)
         solution = solve_pnp(
-            camera, uv, points_scene, self._config.max_reprojection_px, T_scene_cam
+            camera, uv_image, points, self._config.max_reprojection_px, T_scene_cam
         )
         if solution is None:
-            return Refinement(None, None, Evidence(matches=len(uv), coverage=coverage))
+            return Refinement(None, None, Evidence(method, looked_at, coverage=view.coverage))
         inliers, residuals = solution.inliers, solution.residuals_px[solution.inliers]
         evidence = Evidence(
-            matches=len(uv),
+            method=method,
+            matches=looked_at,
             inliers=int(inliers.sum()),
             residual_px=float(np.median(residuals)),
-            coverage=coverage,
-            spread=_spread(uv[inliers], camera),
+            coverage=view.coverage,
+            spread=_spread(uv_image[inliers], camera),
         )
-        points_inlier = points_scene[inliers]
-        covariance = pose_covariance(camera, solution.T_scene_cam, points_inlier, residuals)
-        depths = transform_points(inverse(solution.T_scene_cam), points_inlier)[:, 2]
-        covariance = self._calibrated(covariance, float(np.median(depths)))
-        return Refinement(solution.T_scene_cam, covariance, evidence)
+        covariance = pose_covariance(camera, solution.T_scene_cam, points[inliers], residuals)
+        depths = transform_points(inverse(solution.T_scene_cam), points[inliers])[:, 2]
+        return Refinement(
+            solution.T_scene_cam, self._calibrated(covariance, float(np.median(depths))), evidence
+        )
 
     def _calibrated(self, covariance: Array, median_depth: float) -> Array:
         """The covariance with what the matches' scatter cannot show: the map's own errors."""
@@ -139,19 +215,22 @@ class Refiner:
         floor = np.diag([position**2] * 3 + [rotation**2] * 3)
         return config.covariance_inflation * covariance + floor
 
-
-def rendered_at(
-    render: RenderFunction, camera: Camera, T_scene_cam: Array
-) -> NDArray[np.uint8]:
-    """The map's uint8 RGB image at a pose."""
-    return _to_u8(render(camera, T_scene_cam)[0])
+    def _status(self, refinement: Refinement) -> Status:
+        return judge(refinement.evidence, self._verify)[0]
 
 
-def _to_u8(rgb: Image) -> NDArray[np.uint8]:
+def to_u8(rgb: Image) -> NDArray[np.uint8]:
+    """uint8 image of a render in [0, 1]."""
     return np.asarray(np.clip(rgb * 255 + 0.5, 0, 255), np.uint8)
 
 
-def _spread(uv: NDArray[np.float32], camera: Camera) -> float:
+def _motion_px(camera: Camera, T_a: Array, T_b: Array, median_depth: float) -> float:
+    """Roughly how far the image moves between two poses, in pixels."""
+    angle_deg, distance = pose_error(T_a, T_b)
+    return camera.fx * float(np.radians(angle_deg) + distance / max(median_depth, 1e-9))
+
+
+def _spread(uv: Pixels, camera: Camera) -> float:
     """Share of the image that a box of +-2 standard deviations of the pixels covers."""
     if len(uv) < 2:
         return 0.0

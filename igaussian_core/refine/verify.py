@@ -13,13 +13,15 @@ class Evidence:
     """What the last round of refinement saw.
 
     Attributes:
-        matches: pairs of image and render pixels with trusted depth.
+        method: where the correspondences came from: "align", "xfeat", "sift".
+        matches: correspondences of image and render looked at, with trusted depth.
         inliers: of them, those that agree with the pose.
         residual_px: the inliers' median reprojection error.
         coverage: share of the render's pixels that the map covers.
         spread: share of the image's area that the inliers' spread covers.
     """
 
+    method: str
     matches: int = 0
     inliers: int = 0
     residual_px: float = float("nan")
@@ -31,16 +33,10 @@ class Evidence:
         return self.inliers / self.matches if self.matches else 0.0
 
 
-def judge(evidence: Evidence, matcher: str, config: VerifyConfig) -> tuple[Status, str]:
-    """The verdict and its reason in words.
-
-    Args:
-        matcher: name of the matcher, which decides the thresholds.
-    """
-    sift = matcher == "sift"
-    min_inliers = config.min_inliers_sift if sift else config.min_inliers_xfeat
-    min_ratio = config.min_ratio_sift if sift else config.min_ratio_xfeat
+def judge(evidence: Evidence, config: VerifyConfig) -> tuple[Status, str]:
+    """The verdict and its reason in words."""
     e = evidence
+    min_inliers, min_ratio = _thresholds(e.method, config)
     if e.coverage < config.min_coverage:
         return Status.OUT_OF_MAP, f"the map covers {e.coverage:.0%} of the view"
     if e.matches < min_inliers:
@@ -55,3 +51,12 @@ def judge(evidence: Evidence, matcher: str, config: VerifyConfig) -> tuple[Statu
     if e.inliers < 1.5 * min_inliers or e.ratio < 1.25 * min_ratio:
         return Status.OK_DEGRADED, f"{e.inliers} of {e.matches} matches agree: little evidence"
     return Status.OK, f"{e.inliers} of {e.matches} matches agree"
+
+
+def _thresholds(method: str, config: VerifyConfig) -> tuple[int, float]:
+    """Least inliers and inlier ratio of a kind of correspondences."""
+    return {
+        "align": (config.min_inliers_align, config.min_ratio_align),
+        "xfeat": (config.min_inliers_xfeat, config.min_ratio_xfeat),
+        "sift": (config.min_inliers_sift, config.min_ratio_sift),
+    }[method]
