@@ -15,6 +15,7 @@ import igaussian_core
 from igaussian_core import errors
 from igaussian_core.coarse.landmarks import LandmarkLocalizer
 from igaussian_core.localizer import Localizer
+from igaussian_core.query import Query
 from igaussian_core.refine.refiner import Refiner
 
 CORE = Path(igaussian_core.__file__).parent
@@ -23,11 +24,11 @@ CORE = Path(igaussian_core.__file__).parent
 LAYERS = [
     ["errors"],
     ["config", "geometry", "camera", "camera_info", "image_decode", "timing", "result",
-     "hypothesis", "frame", "resources", "worker"],
+     "hypothesis", "frame", "resources", "worker", "contrast"],
     ["render", "posed_images", "bag_storage", "bags", "formats", "colour",
      "pictures"],
     ["gaussian_map"],
-    ["views", "lifting", "pnp", "features", "map_package", "view_planning", "overview",
+    ["views", "lifting", "pnp", "features", "query", "map_package", "view_planning", "overview",
      "pruning", "map_summary"],
     ["coarse", "refine"],
     ["localizer"],
@@ -148,6 +149,7 @@ def test_the_import_test_can_fail(tmp_path: Path) -> None:
     "function",
     [
         Localizer.__init__, Localizer.open, Localizer.localize, Refiner.__init__, Refiner.refine,
+        Refiner.align, Refiner.match, Query.__init__,
         LandmarkLocalizer.__init__, LandmarkLocalizer.hypotheses, LandmarkLocalizer.rank_views,
     ],
     ids=lambda f: f.__qualname__,

@@ -248,7 +248,7 @@ def test_localize_as_json(igaussian: Command, photo: Path, room_igmap: Path) -> 
     assert ran.code == 0
     result = json.loads(ran.out)
     angle, distance = pose_error(result["T_map_cam"], QUERY)
-    assert angle < 1.2 and distance < 0.03
+    assert angle < 0.15 and distance < 0.004
     assert result["ok"] is True and result["status"] in ("ok", "ok_degraded")
     assert np.array(result["covariance"]).shape == (6, 6)
     assert result["source"] == "landmarks" and result["timings_ms"]["total"] > 0
@@ -259,7 +259,7 @@ def test_localize_for_people(igaussian: Command, photo: Path, room_igmap: Path) 
     ran = localize(igaussian, photo, room_igmap)
     assert ran.code == 0
     numbers = ran.out.split("position x y z")[1].split("]")[0].split("[")[1]
-    assert np.allclose([float(v) for v in numbers.split(",")], QUERY[:3, 3], atol=0.03)
+    assert np.allclose([float(v) for v in numbers.split(",")], QUERY[:3, 3], atol=0.005)
 
 
 def test_localize_with_a_prior_and_settings(
@@ -339,7 +339,7 @@ def test_eval_photos(
     data = json.loads(out.read_text())
     assert [query["name"] for query in data["queries"]] == ["1.png", "2.png"]  # held out only
     assert data["summary"]["queries"] == 2 and data["summary"]["accepted"] == 2
-    assert data["summary"]["max_deg"] < 1.2
+    assert data["summary"]["max_deg"] < 0.15
     assert data["config"]["coarse"]["top_views"] == Config().coarse.top_views
 
 

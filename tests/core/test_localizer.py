@@ -38,7 +38,7 @@ NUDGE = compose(rotation_from_vector([0.02, 0.025, -0.01]), [0.02, -0.01, 0.02])
 
 
 def assert_right(
-    result: LocalizationResult, T_true: np.ndarray, degrees: float = 1.2, metres: float = 0.03
+    result: LocalizationResult, T_true: np.ndarray, degrees: float = 0.15, metres: float = 0.004
 ) -> None:
     assert result.ok, f"{result.status}: {result.reason}"
     assert result.T_map_cam is not None and is_rigid(result.T_map_cam, 1e-6)
@@ -55,11 +55,11 @@ def results(localizer: Localizer, room_map: GaussianMap) -> list[LocalizationRes
 def test_photos_are_localized_from_nothing(results: list[LocalizationResult]) -> None:
     for result, T in zip(results, QUERIES, strict=True):
         assert_right(result, T)
-        assert result.source == "landmarks" and result.matcher == "xfeat"
+        assert result.source == "landmarks" and result.matcher in ("align", "xfeat")
     errors = np.array(
         [pose_error(r.T_map_cam, T) for r, T in zip(results, QUERIES, strict=True)]  # type: ignore[arg-type]
     )
-    assert np.median(errors[:, 0]) < 0.5 and np.median(errors[:, 1]) < 0.012
+    assert np.median(errors[:, 0]) < 0.03 and np.median(errors[:, 1]) < 0.001
 
 
 def test_the_evidence_is_complete(results: list[LocalizationResult]) -> None:
@@ -70,10 +70,14 @@ def test_the_evidence_is_complete(results: list[LocalizationResult]) -> None:
         assert 0 <= result.residual_px < 2
         assert 0.7 < result.coverage <= 1
         assert result.T_map_cam_coarse is not None and is_rigid(result.T_map_cam_coarse, 1e-6)
-        stages = {"prepare", "extract", "coarse", "render", "match", "solve", "total"}
+        stages = {"prepare", "extract", "coarse", "render", "solve", "total"}
         assert set(result.timings_ms) >= stages
         total = result.timings_ms["total"]
-        assert 0 < sum(result.timings_ms[s] for s in stages - {"total"}) <= 1.001 * total
+        assert (
+            0
+            < sum(ms for stage, ms in result.timings_ms.items() if stage != "total")
+            <= 1.001 * total
+        )
 
 
 def test_the_covariance_is_a_covariance(results: list[LocalizationResult]) -> None:
@@ -178,7 +182,7 @@ def test_what_is_not_the_room_is_not_accepted(
 def test_another_scene_is_not_accepted(localizer: Localizer) -> None:
     """A room of the same shape with other walls, even at the right prior."""
     other = room.room(seed=2)
-    for T in QUERIES[:2]:
+    for T in QUERIES[:1]:
         for prior in (None, T):
             result = localizer.localize(room.photo(other, T), room.CAMERA, prior)
             assert not result.ok and result.T_map_cam is None
@@ -258,7 +262,7 @@ def test_poses_are_published_in_the_map_frame(
     aligned: Localizer, results: list[LocalizationResult], room_map: GaussianMap
 ) -> None:
     result = aligned.localize(room.photo(room_map, QUERIES[0]), room.CAMERA)
-    assert_right(result, S.camera(QUERIES[0]), metres=0.06)
+    assert_right(result, S.camera(QUERIES[0]), metres=0.008)
     assert np.allclose(result.T_map_cam, S.camera(results[0].T_map_cam), atol=1e-5)  # type: ignore[arg-type]
     # the covariance turns and grows with it: metres squared, radians unchanged
     turn = np.kron(np.diag([S.scale, 1.0]), S.rotation)
@@ -270,7 +274,7 @@ def test_priors_are_in_the_map_frame(aligned: Localizer, room_map: GaussianMap) 
     T_map_cam = S.camera(QUERIES[1])
     image = room.photo(room_map, QUERIES[1])
     result = aligned.localize(image, room.CAMERA, T_map_cam @ NUDGE)
-    assert_right(result, T_map_cam, metres=0.06)
+    assert_right(result, T_map_cam, metres=0.008)
     assert result.source == "prior"
     assert np.allclose(result.T_map_cam_coarse, T_map_cam @ NUDGE, atol=1e-9)  # type: ignore[arg-type]
 
@@ -336,7 +340,7 @@ def test_an_object_with_sift(tmp_path: Path, room_map: GaussianMap) -> None:
     save_ply(block(), tmp_path / "block.ply")
     config = Config.from_flat({"features.matcher": "sift"})
     steps: list[tuple[str, int, int]] = []
-    options = CompileOptions(kind="object", views=30, up=(0.0, 0.0, 1.0))
+    options = CompileOptions(kind="object", views=12, up=(0.0, 0.0, 1.0))
     package = compile_map(
         tmp_path / "block.ply", tmp_path / "block.igmap", None, options, config,
         lambda *step: steps.append(step),
@@ -346,13 +350,13 @@ def test_an_object_with_sift(tmp_path: Path, room_map: GaussianMap) -> None:
     assert all(1 <= done <= of for _, done, of in steps)
     localizer = Localizer.open(tmp_path / "block.igmap", config)
     camera = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
-    T = package.landmarks.T_scene_cam[20] @ compose(
+    T = package.landmarks.T_scene_cam[6] @ compose(
         rotation_from_vector([0.05, -0.06, 0.1]), [0.1, 0.05, 0.05]
     )
     rgb, _, _ = localizer.render(camera, T)
     result = localizer.localize(np.clip(rgb * 255, 0, 255).astype(np.uint8), camera)
-    assert_right(result, T, degrees=1.0, metres=0.05)
-    assert result.matcher == "sift"
+    assert_right(result, T, degrees=0.2, metres=0.01)
+    assert result.matcher in ("align", "sift")
     with pytest.raises(MapError, match="compiled with sift"):
         Localizer.open(tmp_path / "block.igmap")
 
