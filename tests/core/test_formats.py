@@ -525,7 +525,7 @@ def test_minimal_files_of_all_formats_agree(splats: Path) -> None:
         spz = load_map(splats / "minimal" / name)
         order = [int(np.linalg.norm(spz.means - m, axis=1).argmin()) for m in splat.means]
         assert sorted(order) == [0, 1, 2, 3], name
-        assert np.allclose(np.abs(spz.means[order]), np.abs(splat.means), atol=1e-3)
+        assert np.allclose(spz.means[order], splat.means, atol=1e-3)
         assert np.allclose(spz.scales[order], splat.scales, rtol=0.04)
         assert np.allclose(spz.opacities[order], splat.opacities, atol=0.01)
 
