@@ -87,13 +87,13 @@ class RefineConfig:
         0.1, "relative depth change within 2 px above which a pixel is an edge", 0, 1
     )
     covariance_inflation: float = _option(
-        8.0, "variance factor, since errors of neighbouring matches are not independent", 1, 1000
+        6.0, "variance factor, since errors of neighbouring matches are not independent", 1, 1000
     )
     position_floor_rel: float = _option(
-        0.0008, "standard deviation of the map's own errors, share of the median depth", 0, 0.1
+        0.0002, "standard deviation of the map's own errors, share of the median depth", 0, 0.1
     )
     rotation_floor_deg: float = _option(
-        0.03, "standard deviation of the map's own errors in degrees", 0, 5
+        0.012, "standard deviation of the map's own errors in degrees", 0, 5
     )
 
 
