@@ -6,7 +6,7 @@ import ctypes
 import os
 import weakref
 from collections.abc import Collection
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +16,15 @@ from igaussian_core.errors import CameraError, IGaussianError, MapError
 from igaussian_core.render import native_library as native
 from igaussian_core.render.native_library import available_simd
 
-__all__ = ["DEFAULT_NEAR", "OUTPUTS", "Rasterizer", "Render", "RenderGradients", "RenderStats", "available_simd"]
+__all__ = [
+    "DEFAULT_NEAR",
+    "OUTPUTS",
+    "Rasterizer",
+    "Render",
+    "RenderGradients",
+    "RenderStats",
+    "available_simd",
+]
 
 OUTPUTS = ("rgb", "depth", "alpha", "median_depth", "ids")
 # 3DGS cuts at 0.2 of a unit, which is 20 cm in a metric map: a robot stands closer to things
@@ -152,13 +160,16 @@ class Rasterizer:
             raise IGaussianError(
                 f"renderer: no memory for {camera.width}x{camera.height} of {self.count} Gaussians"
             )
+        project, sort, blend = frame.nanoseconds
         self.stats = RenderStats(
-            *(nanoseconds * 1e-6 for nanoseconds in frame.nanoseconds),
+            project * 1e-6,
+            sort * 1e-6,
+            blend * 1e-6,
             frame.visible,
             frame.entries,
             frame.cells,
         )
-        return Render(*(images.get(name) for name in OUTPUTS))
+        return _as_render(images)
 
     def render_batch(
         self,
@@ -194,7 +205,7 @@ class Rasterizer:
             self._handle, frames, len(poses), threads or default_threads()
         ):
             raise IGaussianError(f"renderer: no memory for {len(poses)} views")
-        return Render(*(images.get(name) for name in OUTPUTS))  # type: ignore[arg-type]
+        return _as_render(images)
 
     def gradients(
         self,
@@ -341,17 +352,21 @@ def _rigid(T: ArrayLike) -> NDArray[np.float64]:
 
 def _allocate(
     camera: Camera, outputs: Collection[str], views: tuple[int, ...] = ()
-) -> dict[str, NDArray[np.float32] | NDArray[np.int32]]:
+) -> dict[str, NDArray[Any]]:
     unknown = set(outputs) - set(OUTPUTS)
     if unknown:
         raise IGaussianError(
             f"renderer: unknown outputs {sorted(unknown)}; supported: {', '.join(OUTPUTS)}"
         )
     size = (*views, camera.height, camera.width)
-    images: dict[str, NDArray[np.float32] | NDArray[np.int32]] = {}
+    images: dict[str, NDArray[Any]] = {}
     for name in outputs:
         if name == "ids":
             images[name] = np.empty(size, np.int32)
         else:
             images[name] = np.empty((*size, 3) if name == "rgb" else size, np.float32)
     return images
+
+
+def _as_render(images: dict[str, NDArray[Any]]) -> Render:
+    return Render(*(images.get(name) for name in OUTPUTS))

@@ -48,14 +48,15 @@ def _rasterizer(tensors: list[Tensor], antialiased: bool) -> Rasterizer:
         )
     ):
         return _packed.rasterizer
-    arrays = [tensor.detach().numpy() for tensor in tensors]
-    rasterizer = Rasterizer(*arrays, antialiased=antialiased)
+    means, quats_wxyz, scales, opacities, sh = (tensor.detach().numpy() for tensor in tensors)
+    rasterizer = Rasterizer(means, quats_wxyz, scales, opacities, sh, antialiased)
     _packed = _Packed([tensor.detach() for tensor in tensors], versions, antialiased, rasterizer)
     return rasterizer
 
 
 def _camera(size: list[int], intrinsics: list[float]) -> Camera:
-    return Camera(size[0], size[1], *intrinsics)
+    fx, fy, cx, cy = intrinsics
+    return Camera(size[0], size[1], fx, fy, cx, cy)
 
 
 @torch.library.custom_op("igaussian::render", mutates_args=(), device_types="cpu")

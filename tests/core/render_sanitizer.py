@@ -22,7 +22,8 @@ KERNELS = {
     "Avx2": ["-mavx2", "-mfma", "-mf16c", "-mbmi2"],
     "Avx512": ["-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl", "-mfma", "-mf16c", "-mbmi2"],
 }
-FLAGS = "-std=c++17 -O1 -g -fPIC -fno-math-errno -fno-trapping-math -pthread -w".split()
+FLAGS = ["-std=c++17", "-O1", "-g", "-fPIC", "-pthread", "-w"]
+FLAGS += ["-fno-math-errno", "-fno-trapping-math"]
 # float to int of lanes that are not used is undefined in C++ and harmless
 SANITIZE = ["-fsanitize=address,undefined", "-fno-sanitize=float-cast-overflow,shift"]
 
