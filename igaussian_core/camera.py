@@ -184,7 +184,7 @@ def _undistort_tables(
         map_x, map_y = cv2.initUndistortRectifyMap(
             camera.K, dist, np.eye(3), target.K, size, cv2.CV_32FC1
         )
-    return target, map_x, map_y
+    return target, np.asarray(map_x, np.float32), np.asarray(map_y, np.float32)
 
 
 def _inscribed_pinhole(camera: Camera) -> Camera:

@@ -68,7 +68,9 @@ class CoarseConfig:
 class RefineConfig:
     """Stage two: match the image with a render at the hypothesis, PnP with rendered depth."""
 
-    align_points: int = _option(400, "points of a render that are followed into the image", 16, 4096)
+    align_points: int = _option(
+        400, "points of a render that are followed into the image", 16, 4096
+    )
     align_window: int = _option(15, "side in pixels of the patches that are followed", 5, 51)
     align_levels: int = _option(
         2, "pyramid levels of following: 2 finds points about 15 pixels off", 0, 5
@@ -129,7 +131,9 @@ class RuntimeConfig:
     """The machine."""
 
     threads: int = _option(2, "threads of networks and renderer", 1, 256)
-    max_image_age_s: float = _option(1.0, "frames older than this when work starts are dropped", 0, 60)
+    max_image_age_s: float = _option(
+        1.0, "frames older than this when work starts are dropped", 0, 60
+    )
 
 
 @dataclass(frozen=True)
@@ -159,9 +163,8 @@ class Config:
             group, key = name.split(".")
             groups.setdefault(group, {})[key] = _checked(name, value, known[name])
         parts = {
-            f.name: dataclasses.replace(f.default_factory(), **groups.get(f.name, {}))
-            for f in dataclasses.fields(Config)
-            if not isinstance(f.default_factory, type(dataclasses.MISSING))
+            name: group(**groups.get(name, {}))
+            for name, group in typing.get_type_hints(Config).items()
         }
         return Config(**parts)
 
@@ -178,7 +181,8 @@ class Config:
             raise ConfigError(f"{path}: no configuration: {error}") from error
         if not isinstance(data, dict) or not all(isinstance(v, dict) for v in data.values()):
             raise ConfigError(f"{path}: expected an object of groups, e.g. {{'refine': {{...}}}}")
-        return Config.from_flat({f"{g}.{k}": v for g, part in data.items() for k, v in part.items()})
+        flat = {f"{g}.{k}": v for g, part in data.items() for k, v in part.items()}
+        return Config.from_flat(flat)
 
     def to_flat(self) -> dict[str, Any]:
         """Dotted names to values, in the order of this file."""
@@ -228,6 +232,8 @@ def _checked(name: str, value: Any, option: Option) -> Any:
         )
     if option.choices and value not in option.choices:
         raise ConfigError(f"config: {name}='{value}' is none of {', '.join(option.choices)}")
-    if option.low is not None and not option.low <= value <= (option.high or float("inf")):
+    if option.low is not None and option.high is not None and (
+        not option.low <= float(typing.cast(float, value)) <= option.high
+    ):
         raise ConfigError(f"config: {name}={value} is outside [{option.low}, {option.high}]")
     return value

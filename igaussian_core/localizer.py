@@ -199,9 +199,9 @@ def _covariance_in_map(refinement: Refinement, T_map_scene: Sim3) -> Array | Non
 
 
 def _contrast(image: NDArray[np.uint8]) -> float:
-    """Standard deviation of the grey levels, seen at low resolution so that noise is no contrast."""
-    small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (64, 48), interpolation=cv2.INTER_AREA)
-    return float(np.std(small))
+    """Standard deviation of grey levels at low resolution, where noise is no contrast."""
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return float(np.std(cv2.resize(gray, (64, 48), interpolation=cv2.INTER_AREA)))
 
 
 def _timed(result: LocalizationResult, timer: StageTimer) -> LocalizationResult:

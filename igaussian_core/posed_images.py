@@ -75,14 +75,14 @@ def read_image(
         raise DatasetError(f"{path}: no such file" if not Path(path).is_file() else
                            f"{path}: not a readable image")  # fmt: skip
     if raw.dtype == np.uint16:
-        raw = (raw >> 8).astype(np.uint8)
+        raw = np.right_shift(raw, 8).astype(np.uint8)
     if raw.ndim == 2:
         return np.asarray(cv2.cvtColor(raw, cv2.COLOR_GRAY2RGB), np.uint8)
     if raw.shape[2] == 3:
         return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BGR2RGB), np.uint8)
     rgba = cv2.cvtColor(raw, cv2.COLOR_BGRA2RGBA).astype(np.float32)
     alpha = rgba[..., 3:] / 255
-    blended = rgba[..., :3] * alpha + np.float32(background) * (1 - alpha)
+    blended = rgba[..., :3] * alpha + np.array(background, np.float32) * (1 - alpha)
     return np.asarray(np.rint(blended), np.uint8)
 
 
@@ -223,7 +223,8 @@ def _colmap_camera(model: str, width: int, height: int, p: tuple[float, ...]) ->
     dist = p[4:]
     if model in ("SIMPLE_RADIAL", "RADIAL"):
         dist = (*dist, 0.0, 0.0, 0.0)[:4]
-    return _corner_camera(width, height, *p[:4], _COLMAP_MODELS[model][2], dist)
+    fx, fy, cx, cy = p[:4]
+    return _corner_camera(width, height, fx, fy, cx, cy, _COLMAP_MODELS[model][2], dist)
 
 
 def _unpack(stream: BinaryIO, layout: str) -> tuple[Any, ...]:

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from igaussian_core.camera import Camera
 from igaussian_core.config import RefineConfig, VerifyConfig
+from igaussian_core.contrast import Gray, normalize_contrast
 from igaussian_core.features import Matcher
 from igaussian_core.geometry import inverse, pose_error, transform_points
 from igaussian_core.lifting import at_pixels, sample, trusted_depth, unproject
 from igaussian_core.pnp import pose_covariance, solve_pnp
 from igaussian_core.query import Query
-from igaussian_core.contrast import Gray, normalize_contrast
 from igaussian_core.refine.alignment import corners, follow
 from igaussian_core.refine.verify import Evidence, judge
 from igaussian_core.result import Status
