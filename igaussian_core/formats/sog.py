@@ -24,6 +24,9 @@ from igaussian_core.formats.raw import RawGaussians, quats_from_smallest_three
 Bytes = NDArray[np.uint8]
 _MOST_PIXELS = 1 << 26
 _MOST_FILE_BYTES = 1 << 29
+# RuntimeError: encrypted; NotImplementedError: an unknown version or method
+_ZIP_ERRORS = (zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError, EOFError,
+               zlib.error)  # fmt: skip
 _PALETTE_COLUMNS = 64
 _COEFFICIENTS = {1: 3, 2: 8, 3: 15}  # SH bands -> coefficients beyond the constant one
 
@@ -95,14 +98,13 @@ def read_archive(file: Path) -> RawGaussians:
             return archive.read(info)
         except KeyError as error:
             raise MapError(f"{file}: a zip archive without {name}; supported: .sog") from error
-        except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError,
-                zlib.error) as error:  # fmt: skip
+        except _ZIP_ERRORS as error:
             raise MapError(f"{file}: {name} is damaged: {error}") from error
 
     try:
         with zipfile.ZipFile(file) as archive:
             return _read(_Parts(file, fetch))
-    except zipfile.BadZipFile as error:
+    except _ZIP_ERRORS as error:
         raise MapError(f"{file}: damaged zip archive: {error}") from error
 
 

@@ -182,8 +182,10 @@ def _decode(
     if header.degree == 4:
         log.warning("%s: spherical harmonics of degree 4 are cut to degree 3", file)
         sh = np.ascontiguousarray(sh[:, :16])
+    with np.errstate(invalid="ignore"):  # not-a-number among half floats; left out later
+        means = _positions(header, positions) * signs
     return RawGaussians(
-        means=_positions(header, positions) * signs,
+        means=means,
         quats_wxyz=_quats(header, rotations, signs),
         scales=np.exp(scales.reshape(-1, 3).astype(np.float32) / 16 - 10),
         opacities=alphas.astype(np.float32) / np.float32(255),

@@ -540,3 +540,12 @@ def test_real_map_survives_spz(splats: Path, tmp_path: Path) -> None:
     a, _, _ = gmap.render(camera, np.eye(4))
     b, _, _ = load_map(tmp_path / "map.spz").render(camera, np.eye(4))
     assert -10 * np.log10(np.mean((a - b) ** 2)) > 40
+
+
+def test_zip_of_an_unknown_version(tmp_path: Path) -> None:
+    path = write_sog(files.sog_files(files.soft_map(count=40)), tmp_path, archive=True)
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x01\x02") + 6] = 200
+    path.write_bytes(data)
+    with pytest.raises(MapError, match="damaged zip archive"):
+        load_map(path)
