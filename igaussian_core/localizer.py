@@ -106,6 +106,14 @@ class Localizer:
                 failure = result
         return _timed(failure, timer)
 
+    def warm_up(self) -> None:
+        """Run every network once, so that the first frame takes no longer than the others."""
+        rng = np.random.default_rng(0)
+        image = rng.integers(0, 255, (480, 640, 3), dtype=np.uint8)
+        features = self._matcher.extract(image, self._config.features.keypoints)
+        self._landmarks.rank_views(features)
+        self._matcher.match(features, features)
+
     def render(self, camera: Camera, T_map_cam: ArrayLike) -> tuple[Image, Image, Image]:
         """RGB [H, W, 3], depth [H, W] in metres and alpha [H, W] of the map at a pose.
 

@@ -203,6 +203,7 @@ class LocalizerNode(Node):
             if not path:
                 raise MapError("parameter map_path is empty: set it to a compiled map (.igmap)")
             localizer = Localizer.open(path, self._settings.config)
+            localizer.warm_up()
             tracker = Tracker(localizer, self._settings.config)
             self._worker.call(lambda: self._use(tracker, path)).result()
         except IGaussianError as error:
