@@ -45,7 +45,13 @@ def main() -> int:
         "--odometry", action="store_true", help="use /odom, and base_to_camera of /tf_static"
     )
     parser.add_argument("--errors", action="store_true", help="list every pose's error")
+    parser.add_argument(
+        "--judge-every", type=int, default=1, metavar="N",
+        help="judge every Nth image only, from the first (needs --stamp bag)",
+    )  # fmt: skip
     options = parser.parse_args()
+    if options.judge_every > 1 and options.stamp != "bag":
+        parser.error("--judge-every needs --stamp bag")
 
     os.environ.setdefault("ROS_DOMAIN_ID", str(20 + os.getpid() % 80))
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -64,7 +70,7 @@ def main() -> int:
         _wait(lambda: listener.diagnostics.get("map", "") != "", 120, node)
         subprocess.run(_replay_command(options), check=True)
         time.sleep(2.5)  # the last frames, and diagnostics of them
-        figures = _figures(listener, options.T_base_cam)
+        figures = _figures(listener, options.T_base_cam, _judged_stamps(options))
     finally:
         node.send_signal(signal.SIGINT)
         try:
@@ -128,9 +134,21 @@ def _wait(condition, timeout_s: float, node: subprocess.Popen) -> None:  # type:
         time.sleep(0.1)
 
 
-def _figures(listener: Listener, T_base_cam: np.ndarray | None) -> dict[str, float | int | str]:
+def _judged_stamps(options: argparse.Namespace) -> set[int] | None:
+    """Stamps of the images to judge; None: all."""
+    if options.judge_every == 1:
+        return None
+    with Bag(options.bag) as recording:
+        return {f.stamp_ns for f in list(recording.frames())[:: options.judge_every]}
+
+
+def _figures(
+    listener: Listener, T_base_cam: np.ndarray | None, judged: set[int] | None
+) -> dict[str, float | int | str]:
     poses, diagnostics = listener.poses, listener.diagnostics
     T_cam_base = None if T_base_cam is None else inverse(T_base_cam)
+    if judged is not None:
+        listener.poses = [pose for pose in poses if pose.stamp_ns in judged]
     errors = np.array(listener.errors(T_cam_base)).reshape(-1, 2)
     latencies = [pose.latency_ms for pose in poses]
     span_s = (poses[-1].received_ns - poses[0].received_ns) * 1e-9 if len(poses) > 1 else 0.0
@@ -143,6 +161,7 @@ def _figures(listener: Listener, T_base_cam: np.ndarray | None) -> dict[str, flo
     return {
         "processed": processed,
         "accepted": len(poses),
+        "true_poses": len(listener.truth),
         "judged": len(errors),
         "median_error_m": percentile(errors[:, 1], 50),
         "median_error_deg": percentile(errors[:, 0], 50),

@@ -155,7 +155,7 @@ class Replayer:
         end = time.monotonic() + self._options.wait_s
         while time.monotonic() < end and not self._over.is_set():
             if all(publisher.get_subscription_count() > 0 for publisher in awaited):
-                self._over.wait(0.3)  # the other side has to match, too
+                self._wait_for_the_rest(min(end, time.monotonic() + 2))
                 return
             self._over.wait(0.02)
         if self._options.wait_s > 0 and not self._over.is_set():
@@ -163,6 +163,19 @@ class Replayer:
             self._node.get_logger().warning(
                 f"no subscriber of {names} within {self._options.wait_s:g} s; starting all the same"
             )
+
+    def _wait_for_the_rest(self, end: float) -> None:
+        """Until every subscriber that is known of is connected."""
+        publishers = [channel.publisher for channel in self._channels.values()]
+        self._over.wait(0.3)  # the other side has to connect, too
+        while time.monotonic() < end and not self._over.is_set():
+            if all(
+                self._node.count_subscribers(publisher.topic_name)
+                <= publisher.get_subscription_count()
+                for publisher in publishers
+            ):
+                return
+            self._over.wait(0.02)
 
     def _run_once(self) -> None:
         """The chosen part of the recording once."""
