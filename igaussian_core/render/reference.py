@@ -7,6 +7,7 @@ bounds memory and time, it does not change the result.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -154,8 +155,8 @@ def project(
     return Projection(uv, conic, opacity, colour, pz, extent, index)
 
 
-def _blend(p: Projection, pixels: Tensor, background: Tensor) -> list[Tensor]:
-    """rgb [P, 3], depth, alpha, median depth, ids [P] of pixels [P, 2]."""
+def weights(p: Projection, pixels: Tensor) -> Tensor:
+    """Share [M, P] of each Gaussian in the colour of pixels [P, 2]."""
     d = pixels[None] - p.uv[:, None]  # [M, P, 2]
     dx, dy = d.unbind(-1)
     a, b, c = (p.conic[:, k, None] for k in range(3))
@@ -165,7 +166,12 @@ def _blend(p: Projection, pixels: Tensor, background: Tensor) -> list[Tensor]:
     after = torch.cumprod(1 - alpha, 0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
     # the Gaussian that would end the pixel is dropped, with all behind it
-    weight = torch.where((after >= STOP).detach(), alpha * before, 0.0)
+    return torch.where((after >= STOP).detach(), alpha * before, 0.0)
+
+
+def _blend(p: Projection, pixels: Tensor, background: Tensor) -> list[Tensor]:
+    """rgb [P, 3], depth, alpha, median depth, ids [P] of pixels [P, 2]."""
+    weight = weights(p, pixels)
     total = weight.sum(0)
     rgb = torch.einsum("mp,mc->pc", weight, p.colour) + (1 - total)[:, None] * background
     drawn = total > 0
@@ -180,6 +186,39 @@ def _blend(p: Projection, pixels: Tensor, background: Tensor) -> list[Tensor]:
         median = torch.where(half.any(0), p.z[first], 0.0)
         ids = torch.where(drawn, p.source[weight.argmax(0)], -1)
     return [rgb, depth, total, median, ids]
+
+
+class Tile(NamedTuple):
+    """One block of pixels and the Gaussians that may show there."""
+
+    height: int
+    width: int
+    pixels: Tensor  # [height * width, 2]
+    gaussians: Projection
+
+
+def tiles(p: Projection, camera: Camera, side: int) -> Iterator[list[Tile]]:
+    """The image in blocks of side x side pixels, row by row."""
+    slack = 0.01
+    low, high = (p.uv - p.extent).detach() - slack, (p.uv + p.extent).detach() + slack
+    for y0 in range(0, camera.height, side):
+        y1 = min(y0 + side, camera.height)
+        in_row = (high[:, 1] >= y0) & (low[:, 1] <= y1 - 1)
+        row = Projection(*(field[in_row] for field in p))
+        row_low, row_high = low[in_row, 0], high[in_row, 0]
+        tiles_of_row = []
+        for x0 in range(0, camera.width, side):
+            x1 = min(x0 + side, camera.width)
+            here = (row_high >= x0) & (row_low <= x1 - 1)
+            y, x = torch.meshgrid(
+                torch.arange(y0, y1, dtype=p.z.dtype),
+                torch.arange(x0, x1, dtype=p.z.dtype),
+                indexing="ij",
+            )
+            pixels = torch.stack([x.reshape(-1), y.reshape(-1)], -1)
+            chosen = Projection(*(field[here] for field in row))
+            tiles_of_row.append(Tile(y1 - y0, x1 - x0, pixels, chosen))
+        yield tiles_of_row
 
 
 def render_reference(
@@ -216,24 +255,14 @@ def render_reference(
         antialiased=antialiased,
     )
     behind = torch.tensor(background, dtype=means.dtype)
-    low, high = (p.uv - p.extent).detach(), (p.uv + p.extent).detach()
-    slack = 0.01
     rows = []
-    for y0 in range(0, camera.height, tile):
-        row = []
-        y1 = min(y0 + tile, camera.height)
-        in_row = (high[:, 1] >= y0 - slack) & (low[:, 1] <= y1 - 1 + slack)
-        for x0 in range(0, camera.width, tile):
-            x1 = min(x0 + tile, camera.width)
-            here = in_row & (high[:, 0] >= x0 - slack) & (low[:, 0] <= x1 - 1 + slack)
-            chosen = Projection(*(field[here] for field in p))
-            y, x = torch.meshgrid(
-                torch.arange(y0, y1, dtype=means.dtype),
-                torch.arange(x0, x1, dtype=means.dtype),
-                indexing="ij",
-            )
-            pixels = torch.stack([x.reshape(-1), y.reshape(-1)], -1)
-            parts = _blend(chosen, pixels, behind)
-            row.append([part.reshape(y1 - y0, x1 - x0, *part.shape[1:]) for part in parts])
-        rows.append([torch.cat(parts, 1) for parts in zip(*row, strict=True)])
+    for row in tiles(p, camera, tile):
+        blocks = [
+            [
+                part.reshape(block.height, block.width, *part.shape[1:])
+                for part in _blend(block.gaussians, block.pixels, behind)
+            ]
+            for block in row
+        ]
+        rows.append([torch.cat(parts, 1) for parts in zip(*blocks, strict=True)])
     return ReferenceRender(*(torch.cat(parts, 0) for parts in zip(*rows, strict=True)))
