@@ -103,8 +103,8 @@ class RefineConfig:
 class VerifyConfig:
     """What a pose must show to be accepted; fixed from held-out photos, see docs/accuracy.md."""
 
-    min_inliers_align: int = _option(60, "least PnP inliers of followed points", 4, 1000)
-    min_ratio_align: float = _option(0.4, "least share of followed points that agree", 0, 1)
+    min_inliers_align: int = _option(40, "least PnP inliers of followed points", 4, 1000)
+    min_ratio_align: float = _option(0.3, "least share of followed points that agree", 0, 1)
     min_inliers_xfeat: int = _option(40, "least PnP inliers with XFeat + LighterGlue", 4, 1000)
     min_ratio_xfeat: float = _option(0.35, "least inlier ratio with XFeat + LighterGlue", 0, 1)
     min_inliers_sift: int = _option(25, "least PnP inliers with SIFT", 4, 1000)
@@ -131,6 +131,9 @@ class RuntimeConfig:
     """The machine."""
 
     threads: int = _option(2, "threads of networks and renderer", 1, 256)
+    budget_ms: float = _option(
+        1000.0, "milliseconds of a frame after which no further hypothesis is tried", 1, 60000
+    )
     max_image_age_s: float = _option(
         1.0, "frames older than this when work starts are dropped", 0, 60
     )

@@ -104,6 +104,8 @@ class Localizer:
                 return _timed(result, timer)
             if result.inliers >= failure.inliers:
                 failure = result
+            if timer.elapsed_ms() > self._config.runtime.budget_ms:
+                break
         return _timed(failure, timer)
 
     def warm_up(self) -> None:

@@ -23,6 +23,10 @@ class StageTimer:
             elapsed = 1e3 * (time.perf_counter() - start)
             self._stages[stage] = self._stages.get(stage, 0.0) + elapsed
 
+    def elapsed_ms(self) -> float:
+        """Milliseconds since the start."""
+        return 1e3 * (time.perf_counter() - self._start)
+
     def timings_ms(self) -> dict[str, float]:
         """Stages in the order of their first use, and the total since the start."""
-        return {**self._stages, "total": 1e3 * (time.perf_counter() - self._start)}
+        return {**self._stages, "total": self.elapsed_ms()}

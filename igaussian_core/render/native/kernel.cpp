@@ -210,10 +210,14 @@ void project(const Model& model, const View& view, int64_t super_block, Splat* s
         std::memcpy(&depth, &s->z, 4);
         const uint64_t key = static_cast<uint64_t>(depth) << 32 | (first_splat + count);
         ++count;
-        for (int y = lanes.y0[l]; y <= lanes.y1[l]; ++y) {
-          for (int x = lanes.x0[l]; x <= lanes.x1[l]; ++x) {
-            file(bins, y * bins->tiles_x + x, key);
-          }
+        const int first = lanes.y0[l] * bins->tiles_x + lanes.x0[l];
+        const int last = lanes.y1[l] * bins->tiles_x + lanes.x1[l];
+        file(bins, first, key);
+        if (first == last) continue;
+        const int wide = lanes.x1[l] - lanes.x0[l];
+        for (int x = first + 1; x <= first + wide; ++x) file(bins, x, key);
+        for (int row = first + bins->tiles_x; row <= last; row += bins->tiles_x) {
+          for (int x = row; x <= row + wide; ++x) file(bins, x, key);
         }
       }
     }
@@ -223,7 +227,7 @@ void project(const Model& model, const View& view, int64_t super_block, Splat* s
 
 // ---------------------------------------------------------------- blending
 
-constexpr int kBatch = 1024;
+constexpr int kBatch = 2048;
 
 // The next Gaussians of one tile, front to back, and the cells of the tile that each touches.
 struct alignas(64) Batch {
@@ -237,7 +241,7 @@ struct alignas(64) Batch {
 // the ellipse reaches farthest right at dy_right, clamped to the row's pixel centres, farthest
 // left at -dy_right.
 inline void cells_touched(Batch* batch, int i, float tile_u, float tile_v) {
-  constexpr int kFields[] = {0, 1, 4, 5, 10, 11, 12};
+  static constexpr int kFields[] = {0, 1, 4, 5, 10, 11, 12};
   F fields[7];
   from_lines(&batch->splats[i].u, kFields, fields);
   const F u = fields[0] - splat(tile_u), v = fields[1] - splat(tile_v);

@@ -69,12 +69,11 @@ inline int append(M m, I x, uint32_t* list, int size) {
   return size + __builtin_popcount(m);
 }
 
-// 16 fields of W Gaussians each, to W lines of 16 floats.
-inline void to_lines(const F* rows, float* lines) {
+inline void transpose(const F* in, F* out) {
   F a[16], b[16];
   for (int i = 0; i < 16; i += 2) {
-    a[i] = _mm512_unpacklo_ps(rows[i], rows[i + 1]);
-    a[i + 1] = _mm512_unpackhi_ps(rows[i], rows[i + 1]);
+    a[i] = _mm512_unpacklo_ps(in[i], in[i + 1]);
+    a[i + 1] = _mm512_unpackhi_ps(in[i], in[i + 1]);
   }
   for (int i = 0; i < 16; i += 4) {
     b[i] = _mm512_shuffle_ps(a[i], a[i + 2], 0x44);
@@ -82,27 +81,33 @@ inline void to_lines(const F* rows, float* lines) {
     b[i + 2] = _mm512_shuffle_ps(a[i + 1], a[i + 3], 0x44);
     b[i + 3] = _mm512_shuffle_ps(a[i + 1], a[i + 3], 0xee);
   }
-  // b[4 * j + i]: quarter q holds fields 4j..4j+3 of line 4q + i
+  // b[4 * j + i]: quarter q holds in[4j] ... in[4j + 3] at 4q + i
   for (int i = 0; i < 4; ++i) {
     const F x = _mm512_shuffle_f32x4(b[i], b[i + 4], 0x44);
     const F y = _mm512_shuffle_f32x4(b[i], b[i + 4], 0xee);
     const F z = _mm512_shuffle_f32x4(b[i + 8], b[i + 12], 0x44);
     const F w = _mm512_shuffle_f32x4(b[i + 8], b[i + 12], 0xee);
-    store(lines + i * 16, _mm512_shuffle_f32x4(x, z, 0x88));
-    store(lines + (i + 4) * 16, _mm512_shuffle_f32x4(x, z, 0xdd));
-    store(lines + (i + 8) * 16, _mm512_shuffle_f32x4(y, w, 0x88));
-    store(lines + (i + 12) * 16, _mm512_shuffle_f32x4(y, w, 0xdd));
+    out[i] = _mm512_shuffle_f32x4(x, z, 0x88);
+    out[i + 4] = _mm512_shuffle_f32x4(x, z, 0xdd);
+    out[i + 8] = _mm512_shuffle_f32x4(y, w, 0x88);
+    out[i + 12] = _mm512_shuffle_f32x4(y, w, 0xdd);
   }
+}
+
+// 16 fields of W Gaussians each, to W lines of 16 floats.
+inline void to_lines(const F* rows, float* lines) {
+  F out[16];
+  transpose(rows, out);
+  for (int i = 0; i < 16; ++i) store(lines + i * 16, out[i]);
 }
 
 // The given fields of W lines of 16 floats.
 template <int kCount>
 inline void from_lines(const float* lines, const int (&fields)[kCount], F* rows) {
-  F in[16];
-  alignas(64) float out[16][16];
+  F in[16], out[16];
   for (int i = 0; i < 16; ++i) in[i] = load(lines + i * 16);
-  to_lines(in, out[0]);
-  for (int k = 0; k < kCount; ++k) rows[k] = load(out[fields[k]]);
+  transpose(in, out);
+  for (int k = 0; k < kCount; ++k) rows[k] = out[fields[k]];
 }
 
 #else
