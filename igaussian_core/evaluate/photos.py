@@ -34,11 +34,19 @@ def held_out_images(
                 f"{note}: no list of the photos that the map was trained on; accuracy on those "
                 "would flatter (--allow-training judges all photos)"
             )
-        trained_on = set(json.loads(note.read_text()).get("trained_on", []))
+        trained_on = _trained_on(note)
         images = [image for image in images if image.name not in trained_on]
     if not images:
         raise DatasetError(f"{poses}: no photo with a pose is left to judge")
     return images
+
+
+def _trained_on(note: Path) -> set[str]:
+    try:
+        return set(json.loads(note.read_text())["trained_on"])
+    except (OSError, LookupError, TypeError, ValueError) as error:
+        cause = f"{type(error).__name__}: {error}"
+        raise DatasetError(f"{note}: names no photos under 'trained_on' ({cause})") from error
 
 
 def extent(images: Sequence[PosedImage]) -> float:

@@ -246,6 +246,24 @@ def test_exposure_does_not_matter(localizer: Localizer, room_map: GaussianMap) -
         assert_right(localizer.localize(exposed, room.CAMERA), QUERIES[1])
 
 
+@pytest.mark.parametrize("hindrance", ["blur", "dark", "occluded"])
+def test_a_spoilt_photo_is_right_or_lost(
+    localizer: Localizer, room_map: GaussianMap, hindrance: str
+) -> None:
+    T = QUERIES[5]
+    image = room.photo(room_map, T)
+    if hindrance == "blur":
+        image = np.asarray(cv2.filter2D(image, -1, np.ones((1, 13)) / 13), np.uint8)
+    elif hindrance == "dark":
+        image = (image * 0.12).astype(np.uint8)
+    else:
+        image[:, :190] = room.photo(room.room(seed=9), T)[:, :190]
+    assert_right(localizer.localize(image, room.CAMERA, T @ NUDGE), T, degrees=0.5, metres=0.015)
+    from_nothing = localizer.localize(image, room.CAMERA)
+    if from_nothing.ok:
+        assert_right(from_nothing, T, degrees=0.5, metres=0.015)
+
+
 S = Sim3(2.0, rotation_from_vector([0.2, -0.4, 1.0]), np.array([10.0, -5.0, 1.0]))
 
 
