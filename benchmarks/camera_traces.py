@@ -1,4 +1,4 @@
-"""How well Gaussians' sizes tell where a map's training cameras were (view_planning.py).
+"""How well Gaussians' sizes tell where a map's training cameras were (camera_traces.py).
 
 For each data set with a map: the share of random positions in the enlarged bounding box that
 look likelier than the true cameras do, in the median and for the worst camera.
@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 from _data import data_folder
 
+from igaussian_core.camera_traces import size_distance_correlation
 from igaussian_core.gaussian_map import load_map
 from igaussian_core.posed_images import read_posed_images
-from igaussian_core.view_planning import size_distance_correlation
 
 
 def main() -> None:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igaussian_core.camera import Camera
+from igaussian_core.camera_traces import likely_camera_positions, size_distance_correlation
 from igaussian_core.gaussian_map import GaussianMap
 from igaussian_core.geometry import inverse
 from igaussian_core.lifting import trusted_depth
-from igaussian_core.view_planning import likely_camera_positions, size_distance_correlation
 from igaussian_core.views import look_at, up_rotation
 
 Array = NDArray[np.float64]

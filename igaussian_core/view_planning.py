@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igaussian_core.camera import Camera
+from igaussian_core.camera_traces import likely_camera_positions
 from igaussian_core.gaussian_map import GaussianMap
 from igaussian_core.geometry import inverse
 from igaussian_core.lifting import trusted_depth
+from igaussian_core.overview import kind_of, likely_up
 from igaussian_core.posed_images import PosedImage
 from igaussian_core.views import (
     fibonacci_directions,
@@ -26,6 +28,7 @@ Progress = Callable[[str, int, int], None]
 
 # of views that the map itself has to suggest: 640x480 with 65 degrees across
 _DEFAULT_CAMERA = Camera(640, 480, 502.0, 502.0, 319.5, 239.5)
+_PLACES = 100  # tried for views of a scene, with 8 views each
 
 
 @dataclass(frozen=True)
@@ -66,13 +69,14 @@ def plan_views(
     """
     low, high = gmap.bounds()
     poses = np.array([image.T_scene_cam for image in posed]).reshape(-1, 4, 4)
-    kind = kind or (_kind_of(poses, low, high) if len(poses) else "scene")
+    kind = kind or (_kind_of(poses, low, high) if len(poses) else kind_of(gmap))
     axis = np.array(up, float) / np.linalg.norm(up) if up else _up_of(poses)
-    upright = np.array([0.0, 0.0, 1.0]) if axis is None else axis
+    if axis is None:
+        axis = likely_up(gmap, kind).vector
     if len(poses):
-        return _plan_from_cameras(posed, poses, low, high, kind, radius, upright, count, max_side)
+        return _plan_from_cameras(posed, poses, low, high, kind, radius, axis, count, max_side)
     if kind == "object":
-        return _plan_object(low, high, radius, upright, count)
+        return _plan_object(low, high, radius, axis, count)
     return _plan_scene(gmap, low, high, radius, axis, count, threads, progress)
 
 
@@ -112,60 +116,26 @@ def _plan_object(
 
 
 def _plan_scene(
-    gmap: GaussianMap, low: Array, high: Array, radius: float | None, up: Array | None, count: int,
+    gmap: GaussianMap, low: Array, high: Array, radius: float | None, up: Array, count: int,
     threads: int, progress: Progress,
 ) -> ViewPlan:  # fmt: skip
-    """The paper's sphere where the training cameras probably were, and views all around there."""
-    positions = likely_camera_positions(gmap, low, high)
-    centre = np.median(positions, axis=0)
-    if up is None:
-        up = _up_of_scene(0.5 * (low + high) - centre, high - low)
-    radius = radius or 0.02 * float(np.linalg.norm(high - low))
-    candidates = _look_around(positions, low, high, up)
-    good = _clear_views(gmap, candidates, threads, progress)
-    chosen = spread_indices(good, count, length=float(np.linalg.norm(high - low)) / 4)
-    poses = [*spherical_views("scene", radius, centre, up), *good[chosen]]
-    return ViewPlan("scene", radius, [SourceView(_DEFAULT_CAMERA, T) for T in poses])
+    """The paper's sphere where the training cameras probably were, and views all around there.
 
-
-def likely_camera_positions(
-    gmap: GaussianMap, low: Array, high: Array, samples: int = 4000, share: float = 0.03
-) -> Array:
-    """Where a map's training cameras probably were, [N, 3], read off the Gaussians' sizes.
-
-    Training splits Gaussians until they are small in the image, so their size grows with the
-    distance from the cameras: places from which log size and log distance correlate best are
-    likely. Among random ones, true camera positions rank in the best few per cent
-    (benchmarks/camera_traces.py).
+    Closed rooms may bear no traces of cameras, so places inside the map are tried as well.
     """
-    rng = np.random.default_rng(0)
-    positions = low - 0.75 * (high - low) + rng.random((samples, 3)) * 2.5 * (high - low)
-    correlation = size_distance_correlation(gmap, positions, low, high)
-    return np.asarray(positions[np.argsort(-correlation)[: max(1, int(share * samples))]])
-
-
-def size_distance_correlation(
-    gmap: GaussianMap, positions: Array, low: Array, high: Array
-) -> Array:
-    """Correlation [N] of log size and log distance of the Gaussians from positions [N, 3]."""
-    inside = ((gmap.means > low) & (gmap.means < high)).all(axis=1) & (gmap.opacities > 0.3)
-    index = np.random.default_rng(0).permutation(np.flatnonzero(inside))[:4000]
-    if len(index) < 50:
-        return np.zeros(len(positions))
-    points = gmap.means[index].astype(np.float64)
-    two_largest = np.sort(gmap.scales[index].astype(np.float64), axis=1)[:, 1:]
-    log_size = _standardized(np.log(np.maximum(two_largest, 1e-9)).mean(axis=1))
-    return np.array(
-        [
-            log_size @ _standardized(np.log(np.linalg.norm(points - position, axis=1) + 1e-9))
-            for position in positions
-        ]
-    )
-
-
-def _standardized(values: Array) -> Array:
-    centred = values - values.mean()
-    return np.asarray(centred / max(float(np.linalg.norm(centred)), 1e-12))
+    likely = likely_camera_positions(gmap, low, high)
+    inside = low + np.random.default_rng(2).random((_PLACES, 3)) * (high - low)
+    centre = np.median(likely, axis=0)
+    radius = radius or 0.02 * float(np.linalg.norm(high - low))
+    good = [
+        _clear_views(gmap, _look_around(places, low, high, up), threads, progress)
+        for places in (likely[:_PLACES], inside)
+    ]
+    poses = [*spherical_views("scene", radius, centre, up)]
+    for part, share in zip(good, (count - count // 3, count // 3), strict=True):
+        chosen = spread_indices(part, share, length=float(np.linalg.norm(high - low)) / 4)
+        poses += [*part[chosen]]
+    return ViewPlan("scene", radius, [SourceView(_DEFAULT_CAMERA, T) for T in poses])
 
 
 def _look_around(positions: Array, low: Array, high: Array, up: Array, each: int = 8) -> Array:
@@ -199,15 +169,6 @@ def _clear_views(
         progress("views tried", i + 1, len(poses))
     best = np.argsort(-scores, kind="stable")[: max(1, int(keep * len(poses)))]
     return poses[best[scores[best] > 0.1]] if (scores > 0.1).any() else poses[best[:1]]
-
-
-def _up_of_scene(towards: Array, extent: Array) -> Array:
-    """z or -y, the usual conventions; never along the view, -y only for maps flat that way."""
-    towards = np.abs(towards) / np.linalg.norm(towards)
-    flat = extent[1] < 0.6 * extent[2]
-    if towards[2] > 0.8 or (flat and towards[1] < 0.8):
-        return np.array([0.0, -1.0, 0.0])
-    return np.array([0.0, 0.0, 1.0])
 
 
 def _kind_of(poses: Array, low: Array, high: Array) -> str:

@@ -10,14 +10,13 @@ import pytest
 import room
 
 from igaussian_core.camera import Camera
+from igaussian_core.camera_traces import likely_camera_positions, size_distance_correlation
 from igaussian_core.gaussian_map import GaussianMap
 from igaussian_core.geometry import is_rigid
 from igaussian_core.posed_images import PosedImage
 from igaussian_core.view_planning import (
     ViewPlan,
-    likely_camera_positions,
     plan_views,
-    size_distance_correlation,
 )
 from igaussian_core.views import fibonacci_directions, look_at
 
