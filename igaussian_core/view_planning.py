@@ -127,9 +127,11 @@ def _plan_scene(
     inside = low + np.random.default_rng(2).random((_PLACES, 3)) * (high - low)
     centre = np.median(likely, axis=0)
     radius = radius or 0.02 * float(np.linalg.norm(high - low))
+    tried = [_look_around(places, low, high, up) for places in (likely[:_PLACES], inside)]
+    clearness = _clearness(gmap, np.concatenate(tried), threads, progress)
     good = [
-        _clear_views(gmap, _look_around(places, low, high, up), threads, progress)
-        for places in (likely[:_PLACES], inside)
+        _clear_half(poses, scores)
+        for poses, scores in zip(tried, np.split(clearness, [len(tried[0])]), strict=True)
     ]
     poses = [*spherical_views("scene", radius, centre, up)]
     for part, share in zip(good, (count - count // 3, count // 3), strict=True):
@@ -153,10 +155,8 @@ def _look_around(positions: Array, low: Array, high: Array, up: Array, each: int
     return np.array(poses)
 
 
-def _clear_views(
-    gmap: GaussianMap, poses: Array, threads: int, progress: Progress, keep: float = 0.5
-) -> Array:
-    """The poses whose small render is opaque, free of depth edges and of things right ahead."""
+def _clearness(gmap: GaussianMap, poses: Array, threads: int, progress: Progress) -> Array:
+    """Share [N] of each small render without gaps and depth edges; 0 with things right ahead."""
     small = _DEFAULT_CAMERA.resized(160, 120)
     low, high = gmap.bounds()
     clearance = 0.06 * float(np.linalg.norm(high - low))
@@ -167,7 +167,12 @@ def _clear_views(
         if near > clearance:
             scores[i] = trusted_depth(depth, alpha, 0.8, 0.1).mean()
         progress("views tried", i + 1, len(poses))
-    best = np.argsort(-scores, kind="stable")[: max(1, int(keep * len(poses)))]
+    return scores
+
+
+def _clear_half(poses: Array, scores: Array) -> Array:
+    """The better half of the poses, as far as they show anything; at least one."""
+    best = np.argsort(-scores, kind="stable")[: max(1, len(poses) // 2)]
     return poses[best[scores[best] > 0.1]] if (scores > 0.1).any() else poses[best[:1]]
 
 
