@@ -116,6 +116,9 @@ class VerifyConfig:
     min_spread: float = _option(
         0.05, "least share of the image's area that the inliers' spread covers", 0, 1
     )
+    max_sigma_deg: float = _option(
+        0.7, "largest standard deviation of the pose's rotation, in degrees", 0.01, 90
+    )
 
 
 @dataclass(frozen=True)

@@ -193,6 +193,9 @@ class Refiner:
         if solution is None:
             return Refinement(None, None, Evidence(method, looked_at, coverage=view.coverage))
         inliers, residuals = solution.inliers, solution.residuals_px[solution.inliers]
+        covariance = pose_covariance(camera, solution.T_scene_cam, points[inliers], residuals)
+        depths = transform_points(inverse(solution.T_scene_cam), points[inliers])[:, 2]
+        covariance = self._calibrated(covariance, float(np.median(depths)))
         evidence = Evidence(
             method=method,
             matches=looked_at,
@@ -200,12 +203,9 @@ class Refiner:
             residual_px=float(np.median(residuals)),
             coverage=view.coverage,
             spread=_spread(uv_image[inliers], camera),
+            sigma_deg=float(np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))),
         )
-        covariance = pose_covariance(camera, solution.T_scene_cam, points[inliers], residuals)
-        depths = transform_points(inverse(solution.T_scene_cam), points[inliers])[:, 2]
-        return Refinement(
-            solution.T_scene_cam, self._calibrated(covariance, float(np.median(depths))), evidence
-        )
+        return Refinement(solution.T_scene_cam, covariance, evidence)
 
     def _calibrated(self, covariance: Array, median_depth: float) -> Array:
         """The covariance with what the matches' scatter cannot show: the map's own errors."""

@@ -19,6 +19,7 @@ class Evidence:
         residual_px: the inliers' median reprojection error.
         coverage: share of the render's pixels that the map covers.
         spread: share of the image's area that the inliers' spread covers.
+        sigma_deg: standard deviation of the rotation, over all axes.
     """
 
     method: str
@@ -27,6 +28,7 @@ class Evidence:
     residual_px: float = float("nan")
     coverage: float = float("nan")
     spread: float = 0.0
+    sigma_deg: float = 0.0
 
     @property
     def ratio(self) -> float:
@@ -48,6 +50,8 @@ def judge(evidence: Evidence, config: VerifyConfig) -> tuple[Status, str]:
         return Status.INCONSISTENT, f"median reprojection error {e.residual_px:.2f} px"
     if e.spread < config.min_spread:
         return Status.INCONSISTENT, f"the inliers cover {e.spread:.1%} of the image only"
+    if e.sigma_deg > config.max_sigma_deg:
+        return Status.INCONSISTENT, f"the rotation is known to {e.sigma_deg:.1f} degrees only"
     if e.inliers < 1.5 * min_inliers or e.ratio < 1.25 * min_ratio:
         return Status.OK_DEGRADED, f"{e.inliers} of {e.matches} matches agree: little evidence"
     return Status.OK, f"{e.inliers} of {e.matches} matches agree"

@@ -34,6 +34,7 @@ def test_good_evidence_is_accepted() -> None:
         ({"matches": 2000, "inliers": 300}, Status.INCONSISTENT),
         ({"residual_px": CONFIG.max_residual_px + 0.01}, Status.INCONSISTENT),
         ({"spread": CONFIG.min_spread - 0.01}, Status.INCONSISTENT),
+        ({"sigma_deg": CONFIG.max_sigma_deg + 0.1}, Status.INCONSISTENT),
     ],
 )
 def test_each_lack_is_named(change: dict[str, Any], status: Status) -> None:
