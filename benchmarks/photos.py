@@ -13,14 +13,14 @@ import argparse
 import json
 import math
 import tempfile
-from dataclasses import asdict
 from pathlib import Path
 
 from _data import data_folder
 
 from igaussian_core.compile_map import CompileOptions, compile_map, training_images
-from igaussian_core.evaluate.metrics import QueryOutcome, summarize
-from igaussian_core.evaluate.photos import evaluate_photos, extent, held_out_images
+from igaussian_core.evaluate.metrics import QueryOutcome, summarize, to_json
+from igaussian_core.evaluate.photos import PhotoQueries, extent, held_out_images
+from igaussian_core.evaluate.runner import run
 from igaussian_core.localizer import Localizer
 from igaussian_core.posed_images import PosedImage, read_posed_images
 
@@ -61,14 +61,20 @@ def _photos(work: Path) -> list[dict[str, object]]:
         held_out = held_out_images(folder / "poses.json", None)
         images = [image for image in held_out if image.name.startswith(prefix)]
         size = extent(training_images(folder / "map.ply", folder / "poses.json"))
-        outcomes = evaluate_photos(localizer, images)
+        outcomes = _localized(localizer, images)
         summary = summarize(outcomes, 5.0, 0.05 * size)
         rows.append(
             {"case": name, "extent": size, "summary": summary,
-             "queries": [asdict(o) for o in outcomes]}
+             "queries": [to_json(o) for o in outcomes]}
         )  # fmt: skip
         print(_row(name, summary, outcomes), flush=True)
     return rows
+
+
+def _localized(localizer: Localizer, images: list[PosedImage]) -> list[QueryOutcome]:
+    red, green, blue = localizer.manifest.background
+    queries = PhotoQueries(tuple(images), localizer.T_map_scene, (red, green, blue))
+    return run(lambda: localizer, queries).outcomes
 
 
 def _row(name: str, s: dict[str, float], outcomes: list[QueryOutcome]) -> str:

@@ -13,27 +13,27 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from igaussian_core import __version__
+from igaussian_core.cli_eval import eval_app
+from igaussian_core.cli_tools import (
+    ConfigOption,
+    MapOption,
+    SetOption,
+    Stages,
+    console,
+    direction,
+    load_config,
+    numbers,
+    progress_bars,
+)
 from igaussian_core.errors import ConfigError, IGaussianError
 
 app = typer.Typer(help=__doc__, no_args_is_help=True, pretty_exceptions_enable=False)
 map_app = typer.Typer(help="Compile, inspect and align maps.", no_args_is_help=True)
-eval_app = typer.Typer(help="Measure accuracy against known poses.", no_args_is_help=True)
 app.add_typer(map_app, name="map")
 app.add_typer(eval_app, name="eval")
-console = Console()
-
-MapOption = Annotated[Path, typer.Option("--map", help="compiled map directory (.igmap)")]
-ConfigOption = Annotated[
-    Path | None, typer.Option("--config", help="JSON file of configuration groups")
-]
-SetOption = Annotated[
-    list[str] | None, typer.Option("--set", help="one value, e.g. refine.rounds=2; repeatable")
-]
-
 
 def main() -> None:
     """Entry point: a known error is one line on stderr and exit code 1."""
@@ -63,63 +63,6 @@ def _root(
     pass
 
 
-def load_config(file: Path | None, settings: list[str] | None) -> Any:
-    """Config of a file and of `group.key=value` settings, which win."""
-    from igaussian_core.config import Config
-
-    flat = Config.from_file(file).to_flat() if file else {}
-    for setting in settings or []:
-        name, separator, text = setting.partition("=")
-        if not separator:
-            raise ConfigError(f"--set {setting}: expected group.key=value")
-        try:
-            flat[name] = json.loads(text)
-        except ValueError:
-            flat[name] = text
-    return Config.from_flat(flat)
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        console=console,
-    )  # fmt: skip
-
-
-class _Stages:
-    """Shows one progress bar for each stage as it reports itself."""
-
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-        self._tasks: dict[str, Any] = {}
-
-    def __call__(self, stage: str, done: int, of: int) -> None:
-        if stage not in self._tasks:
-            self._tasks[stage] = self._progress.add_task(stage, total=of)
-        self._progress.update(self._tasks[stage], completed=done, total=of)
-
-
-def _numbers(text: str | None, count: int, name: str) -> tuple[float, ...] | None:
-    if text is None:
-        return None
-    try:
-        values = tuple(float(part) for part in text.replace(",", " ").split())
-    except ValueError as error:
-        raise ConfigError(f"{name} '{text}': expected {count} numbers") from error
-    if len(values) != count:
-        raise ConfigError(f"{name} '{text}': expected {count} numbers, got {len(values)}")
-    if not np.isfinite(values).all():
-        raise ConfigError(f"{name} '{text}': expected finite numbers")
-    return values
-
-
-def _direction(text: str | None, name: str) -> tuple[float, ...] | None:
-    values = _numbers(text, 3, name)
-    if values is not None and not any(values):
-        raise ConfigError(f"{name} '{text}': a direction is not all zero")
-    return values
-
-
 @map_app.command("compile")
 def map_compile(
     source: Annotated[Path, typer.Argument(help="file of Gaussians: .ply, .spz, .sog, .splat")],
@@ -141,11 +84,11 @@ def map_compile(
     from igaussian_core.compile_map import CompileOptions, compile_map
 
     options = CompileOptions(
-        kind=kind, radius=radius, up=_direction(up, "--up"), views=views  # type: ignore[arg-type]
+        kind=kind, radius=radius, up=direction(up, "--up"), views=views  # type: ignore[arg-type]
     )
-    with _progress() as progress:
+    with progress_bars() as progress:
         package = compile_map(
-            source, output, cameras, options, load_config(config, set_), _Stages(progress)
+            source, output, cameras, options, load_config(config, set_), Stages(progress)
         )
     landmarks = package.landmarks
     console.print(
@@ -236,10 +179,10 @@ def map_prune(
     gmap = load_map(source)
     count = _count(keep, len(gmap))
     posed = training_images(source, cameras) if cameras is not None else []
-    with _progress() as progress:
+    with progress_bars() as progress:
         plan = plan_views(
             gmap, posed, kind=None if posed else kind_of(gmap), radius=None, up=None, count=views,
-            max_side=size, threads=threads, progress=_Stages(progress),
+            max_side=size, threads=threads, progress=Stages(progress),
         )  # fmt: skip
     chosen = plan.views[:views]
     result = prune(gmap, chosen, count, max_ms, threads)
@@ -288,7 +231,7 @@ def map_align(
     else:
         if not (np.isfinite(scale) and scale > 0):
             raise ConfigError(f"--scale {scale}: must be positive")
-        axis, point = _direction(up, "--up"), _numbers(origin, 3, "--origin")
+        axis, point = direction(up, "--up"), numbers(origin, 3, "--origin")
         rotation = up_rotation(np.array(axis)).T if axis else np.eye(3)
         T_map_scene = Sim3(scale, rotation, -scale * rotation @ np.array(point or (0.0,) * 3))
     manifest = with_T_map_scene(path, T_map_scene)
@@ -342,8 +285,8 @@ def render(
         write_sequence,
     )  # fmt: skip
 
-    look = _look(source, camera, index, _numbers(size.replace("x", ","), 2, "--size"))
-    colour = _numbers(background, 3, "--background") or look.background
+    look = _look(source, camera, index, numbers(size.replace("x", ","), 2, "--size"))
+    colour = numbers(background, 3, "--background") or look.background
     if orbit is not None:
         frames = (
             to_uint8(look.gmap.render(look.camera, inverse(T), colour)[0])
@@ -436,13 +379,13 @@ def localize(
 
     image = read_image(photo)
     height, width = image.shape[:2]
-    coefficients = _numbers(dist, len(dist.replace(",", " ").split()), "--dist") if dist else None
+    coefficients = numbers(dist, len(dist.replace(",", " ").split()), "--dist") if dist else None
     camera = Camera(
         width, height, fx, fy or fx,
         (width - 1) / 2 if cx is None else cx, (height - 1) / 2 if cy is None else cy,
         model, coefficients or (),
     )  # fmt: skip
-    guess = _numbers(prior, 7, "--prior")
+    guess = numbers(prior, 7, "--prior")
     if guess and not any(guess[3:]):
         raise ConfigError(f"--prior '{prior}': the quaternion is all zero")
     T_prior = compose(rotation_from_quaternion(guess[3:]), guess[:3]) if guess else None
@@ -565,64 +508,6 @@ def replay_bag(
             topics=(image_topic, camera_info_topic),
         )  # fmt: skip
     print(f"{stats.processed} frames processed, {stats.dropped} dropped", file=sys.stderr)
-
-
-@eval_app.command("photos")
-def eval_photos(
-    poses: Annotated[Path, typer.Argument(help="photos with poses, as for map compile --cameras")],
-    map_path: MapOption,
-    note: Annotated[
-        Path | None, typer.Option(help="map.json that names the photos trained on")
-    ] = None,
-    allow_training: Annotated[
-        bool, typer.Option(help="judge photos that the map was trained on, too")
-    ] = False,
-    subset: Annotated[str, typer.Option(help="only photos whose name starts so")] = "",
-    max_deg: Annotated[float, typer.Option(help="success: rotation error below, degrees")] = 5.0,
-    max_extent: Annotated[
-        float, typer.Option(help="success: position error below, share of the cameras' extent")
-    ] = 0.05,
-    json_out: Annotated[Path | None, typer.Option("--json", help="write results here")] = None,
-    config: ConfigOption = None,
-    set_: SetOption = None,
-) -> None:
-    """Localize held-out photos without a prior and compare with their poses."""
-    from igaussian_core.compile_map import training_images
-    from igaussian_core.evaluate.metrics import summarize
-    from igaussian_core.evaluate.photos import evaluate_photos, extent, held_out_images
-    from igaussian_core.localizer import Localizer
-
-    configuration = load_config(config, set_)
-    images = [i for i in held_out_images(poses, note, allow_training) if i.name.startswith(subset)]
-    folder = poses if poses.is_dir() else poses.parent
-    size = extent(training_images(note or folder / "map.ply", poses))
-    localizer = Localizer.open(map_path, configuration)
-    with _progress() as progress:
-        stages = _Stages(progress)
-        outcomes = evaluate_photos(localizer, images, lambda d, n: stages("photos", d, n))
-    limit = max_extent * size * localizer.T_map_scene.scale
-    summary = summarize(outcomes, max_deg, limit)
-    _print_summary(f"{poses}: held-out photos, success < {max_deg:g} deg and {limit:.3g}", summary)
-    for o in outcomes:
-        if not (o.angle_deg < max_deg and o.distance < limit):
-            console.print(f"  {o.name}: {o.status}, {o.angle_deg:.2f} deg, {o.distance:.3g}")
-    if json_out is not None:
-        document = {
-            "summary": summary,
-            "extent": size,
-            "config": dataclasses.asdict(configuration),
-            "queries": [dataclasses.asdict(o) for o in outcomes],
-        }
-        json_out.write_text(json.dumps(document, indent=1))
-
-
-def _print_summary(title: str, summary: dict[str, float]) -> None:
-    table = Table(title=title)
-    table.add_column("figure")
-    table.add_column("value", justify="right")
-    for key, value in summary.items():
-        table.add_row(key, f"{value:.4g}")
-    console.print(table)
 
 
 if __name__ == "__main__":

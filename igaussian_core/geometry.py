@@ -137,6 +137,15 @@ def pose_error(T_a_estimate: ArrayLike, T_a_true: ArrayLike) -> tuple[float, flo
     return angle, float(np.linalg.norm(E[:3, 3] - T[:3, 3]))
 
 
+def interpolate_pose(T_a_start: ArrayLike, T_a_end: ArrayLike, share: float) -> Array:
+    """The pose after `share` of the motion between two poses, at constant body velocity of
+    rotation and translation each; outside [0, 1] it goes on likewise."""
+    start = np.asarray(T_a_start, np.float64)
+    motion = inverse(start) @ np.asarray(T_a_end, np.float64)
+    turn = rotation_from_vector(share * vector_from_rotation(motion[:3, :3]))
+    return np.asarray(start @ compose(turn, share * motion[:3, 3]))
+
+
 @dataclass(frozen=True)
 class Sim3:
     """Similarity x_a = scale * rotation @ x_b + translation, e.g. `T_map_scene` of a map."""

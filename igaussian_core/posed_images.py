@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import struct
+from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +19,23 @@ from numpy.typing import NDArray
 
 from igaussian_core.camera import Camera
 from igaussian_core.errors import CameraError, DatasetError
-from igaussian_core.geometry import compose, inverse, is_rigid, rotation_from_quaternion
+from igaussian_core.geometry import (
+    compose,
+    interpolate_pose,
+    inverse,
+    is_rigid,
+    rotation_from_quaternion,
+)
+from igaussian_core.tum import read_tum, read_tum_list
 
 SUPPORTED = (
     "poses.json, NeRF transforms.json, INRIA cameras.json, "
-    "a COLMAP model's folder (cameras and images as .bin or .txt)"
+    "a COLMAP model's folder (cameras and images as .bin or .txt), "
+    "a TUM folder (rgb.txt, groundtruth.txt, and camera.json with the intrinsics)"
 )
 
+# of a TUM trajectory: stamps further apart are not interpolated over
+_MAX_TUM_GAP_S = 0.1
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # COLMAP's camera models: id, number of parameters, our model
 _COLMAP_MODELS = {
@@ -137,7 +148,32 @@ def _read_folder(folder: Path) -> Iterator[PosedImage]:
         if (folder / name).is_file():
             yield from _read(folder / name)
             return
+    if (folder / "groundtruth.txt").is_file() and (folder / "rgb.txt").is_file():
+        yield from _read_tum_folder(folder)
+        return
     raise DatasetError(f"{folder}: no camera poses in this folder; supported: {SUPPORTED}")
+
+
+def _read_tum_folder(folder: Path) -> Iterator[PosedImage]:
+    """Images that the trajectory covers, each at the pose interpolated to its stamp."""
+    note = folder / "camera.json"
+    if not note.is_file():
+        raise DatasetError(
+            f"{note}: missing; a TUM folder does not say its intrinsics: write width, height, "
+            "fx, fy, cx, cy (first pixel's centre at 0) and perhaps model, dist there"
+        )
+    values = json.loads(note.read_text())
+    camera = Camera(**{**values, "dist": tuple(values.get("dist", ()))})
+    trajectory = sorted(read_tum(folder / "groundtruth.txt"), key=lambda item: item[0])
+    stamps = [stamp for stamp, _ in trajectory]
+    for stamp, name in read_tum_list(folder / "rgb.txt"):
+        after = bisect_left(stamps, stamp)
+        if after < len(stamps) and stamps[after] == stamp:
+            yield PosedImage(name, folder / name, camera, trajectory[after][1])
+        elif 0 < after < len(stamps) and stamps[after] - stamps[after - 1] <= _MAX_TUM_GAP_S:
+            share = (stamp - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+            T = interpolate_pose(trajectory[after - 1][1], trajectory[after][1], share)
+            yield PosedImage(name, folder / name, camera, T)
 
 
 def _corner_camera(

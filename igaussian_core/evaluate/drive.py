@@ -10,13 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from igaussian_core.geometry import (
-    compose,
-    inverse,
-    pose_error,
-    rotation_from_vector,
-    vector_from_rotation,
-)
+from igaussian_core.geometry import interpolate_pose, pose_error
 
 Array = NDArray[np.float64]
 _MAX_TRUTH_GAP_NS = 500_000_000
@@ -89,9 +83,7 @@ class Trajectory:
         if after - before > _MAX_TRUTH_GAP_NS:
             return None
         share = (stamp_ns - before) / (after - before)
-        motion = inverse(self.poses[index - 1]) @ self.poses[index]
-        turn = rotation_from_vector(share * vector_from_rotation(motion[:3, :3]))
-        return np.asarray(self.poses[index - 1] @ compose(turn, share * motion[:3, 3]))
+        return interpolate_pose(self.poses[index - 1], self.poses[index], share)
 
 
 def summarize_drive(

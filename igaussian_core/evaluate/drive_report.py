@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
-import io
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -15,17 +12,29 @@ from typing import Any
 import cv2
 import matplotlib
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from igaussian_core.evaluate.drive import DriveFrame, MemorySample, Trajectory
 from igaussian_core.evaluate.drive_overlays import Overlay
+from igaussian_core.evaluate.metrics import plain
+from igaussian_core.evaluate.page import (
+    BLUE,
+    GREY,
+    RED,
+    cards,
+    facts_table,
+    new_figure,
+    number,
+    page,
+    pictures,
+    plot,
+    png,
+)
 
 Array = NDArray[np.float64]
 
-_TRUTH, _ESTIMATE, _LOST, _GRID = "#8a939e", "#0b6fa4", "#c8322b", "#e4e8ec"
 _LEAVE_OUT = 0.02  # share of the map's points that may lie outside the plan
 
 
@@ -54,12 +63,12 @@ class Drive:
 def write_report(drive: Drive, folder: Path) -> Path:
     """Write report.html, its pictures as PNG and summary.json into a folder; the page's path."""
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = {
-        "trajectory": _png(_trajectory_figure(drive)),
-        "errors": _png(_error_figure(drive)),
-        "latency": _png(_latency_figure(drive)),
+    plots = {
+        "trajectory": png(_trajectory_figure(drive)),
+        "errors": png(_error_figure(drive)),
+        "latency": png(_latency_figure(drive)),
     }
-    for name, data in pictures.items():
+    for name, data in plots.items():
         (folder / f"{name}.png").write_bytes(data)
     for old in folder.glob("overlay_*.png"):
         old.unlink()
@@ -68,19 +77,8 @@ def write_report(drive: Drive, folder: Path) -> Path:
         cv2.imwrite(str(path), overlay.side_by_side()[..., ::-1])
     (folder / "summary.json").write_text(json.dumps(plain(drive.figures), indent=1) + "\n")
     page = folder / "report.html"
-    page.write_text(_page(drive, pictures), encoding="utf-8")
+    page.write_text(_page(drive, plots), encoding="utf-8")
     return page
-
-
-def plain(figures: Mapping[str, float]) -> dict[str, float | int | None]:
-    """Figures as JSON values: whole numbers as integers, NaN as null."""
-    result: dict[str, float | int | None] = {}
-    for name, value in figures.items():
-        if not math.isfinite(value):
-            result[name] = None
-        else:
-            result[name] = int(value) if value == int(value) else round(value, 6)
-    return result
 
 
 def missed(figures: Mapping[str, float], limits: Mapping[str, float]) -> list[str]:
@@ -98,24 +96,6 @@ _AT_LEAST = ("accepted_ratio", "rate_hz")
 
 
 # --- plots ---
-
-
-def _figure(width: float, height: float, rows: int = 1) -> tuple[Figure, Any]:
-    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
-    for axis in axes:
-        axis.grid(color=_GRID, linewidth=0.8)
-        axis.set_axisbelow(True)
-        for side in ("top", "right"):
-            axis.spines[side].set_visible(False)
-    return figure, axes
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
 
 
 def plan_axes(poses: Sequence[Array]) -> tuple[Array, Array, Array, tuple[str, str]]:
@@ -141,7 +121,7 @@ def _trajectory_figure(drive: Drive) -> Figure:
     poses = list(drive.truth.poses) or [
         f.T_map_cam for f in drive.frames if f.T_map_cam is not None
     ]
-    figure, (axis,) = _figure(8.4, 6.4)
+    figure, (axis,) = new_figure(8.4, 6.4)
     if not poses:
         axis.text(0.5, 0.5, "no pose", ha="center", transform=axis.transAxes)
         return figure
@@ -151,7 +131,7 @@ def _trajectory_figure(drive: Drive) -> Figure:
     _draw_map(axis, drive.map_points, plan, up, path)
     true = path @ plan.T
     if len(drive.truth):
-        axis.plot(*true.T, color=_TRUTH, linewidth=5, alpha=0.7, label="truth", zorder=3)
+        axis.plot(*true.T, color=GREY, linewidth=5, alpha=0.7, label="truth", zorder=3)
     _draw_estimates(axis, drive.frames, plan, 0.05 * float(np.ptp(true, axis=0).max()))
     axis.plot(*true[0], "o", color="black", markersize=7, zorder=6, label="start")
     axis.set(xlabel=names[0], ylabel=names[1], aspect="equal")
@@ -196,19 +176,19 @@ def _draw_estimates(
         at = np.array([T[:3, 3] for T in accepted]) @ plan.T
         looking = np.array([T[:3, 2] for T in accepted]) @ plan.T
         ticks = [[a, a + tick_length * v] for a, v in zip(at, looking, strict=True)]
-        axis.add_collection(LineCollection(ticks, colors=_ESTIMATE, linewidths=0.9, zorder=4))
+        axis.add_collection(LineCollection(ticks, colors=BLUE, linewidths=0.9, zorder=4))
         axis.plot(
-            *at.T, ".", color=_ESTIMATE, markersize=6, zorder=5,
+            *at.T, ".", color=BLUE, markersize=6, zorder=5,
             label=f"localized ({len(at)}), tick: viewing direction",
         )  # fmt: skip
     lost = [f.T_map_cam_true for f in frames if f.T_map_cam is None]
     known = np.array([T[:3, 3] for T in lost if T is not None]).reshape(-1, 3) @ plan.T
     if len(known):
-        axis.plot(*known.T, "x", color=_LOST, markersize=7, zorder=5, label=f"lost ({len(known)})")
+        axis.plot(*known.T, "x", color=RED, markersize=7, zorder=5, label=f"lost ({len(known)})")
 
 
 def _error_figure(drive: Drive) -> Figure:
-    figure, axes = _figure(8.4, 4.6, rows=2)
+    figure, axes = new_figure(8.4, 4.6, rows=2)
     accepted = [f for f in drive.frames if f.T_map_cam is not None]
     time = [f.time_s for f in accepted]
     errors = np.array([f.error for f in accepted]).reshape(-1, 2)
@@ -217,27 +197,27 @@ def _error_figure(drive: Drive) -> Figure:
         ("rotation error [deg]", errors[:, 0], "error_deg", 1.0),
     )
     for axis, (label, values, name, factor) in zip(axes, rows, strict=True):
-        axis.plot(time, values, ".-", color=_ESTIMATE, linewidth=1, markersize=5)
+        axis.plot(time, values, ".-", color=BLUE, linewidth=1, markersize=5)
         median = drive.figures.get(f"median_{name}", math.nan) * factor
         if math.isfinite(median):
-            axis.axhline(median, color=_ESTIMATE, linestyle=":", linewidth=1.2)
+            axis.axhline(median, color=BLUE, linestyle=":", linewidth=1.2)
             text = f" median {median:.2g}"
-            axis.annotate(text, (1, median), xycoords=("axes fraction", "data"), color=_ESTIMATE)
+            axis.annotate(text, (1, median), xycoords=("axes fraction", "data"), color=BLUE)
         limit = drive.limits.get(f"max_{name}", math.nan) * factor
         if math.isfinite(limit) and len(values) and np.nanmax(values) > 0.3 * limit:
-            axis.axhline(limit, color=_LOST, linestyle="--", linewidth=1.2)
+            axis.axhline(limit, color=RED, linestyle="--", linewidth=1.2)
         axis.set_ylabel(label)
         axis.set_ylim(bottom=0)
         for frame in drive.frames:
             if frame.T_map_cam is None:
-                axis.axvline(frame.time_s, color=_LOST, linewidth=1, alpha=0.5)
+                axis.axvline(frame.time_s, color=RED, linewidth=1, alpha=0.5)
     lost = any(frame.T_map_cam is None for frame in drive.frames)
     axes[-1].set_xlabel("time in the recording [s]" + ("; red lines: lost" if lost else ""))
     return figure
 
 
 def _latency_figure(drive: Drive) -> Figure:
-    figure, axes = _figure(8.4, 4.6, rows=2)
+    figure, axes = new_figure(8.4, 4.6, rows=2)
     accepted = [f for f in drive.frames if f.T_map_cam is not None]
     time = np.array([f.time_s for f in accepted])
     stages = sorted({s for f in accepted for s in f.timings_ms if s != "total"})
@@ -254,7 +234,7 @@ def _latency_figure(drive: Drive) -> Figure:
     if accepted:
         figure.legend(loc="outside upper center", fontsize=8, ncols=8, frameon=False)
     axes[1].plot(
-        [m.time_s for m in drive.memory], [m.rss_mb for m in drive.memory], color=_ESTIMATE
+        [m.time_s for m in drive.memory], [m.rss_mb for m in drive.memory], color=BLUE
     )
     highest = max((m.rss_mb for m in drive.memory), default=1.0)
     axes[1].set(
@@ -264,25 +244,6 @@ def _latency_figure(drive: Drive) -> Figure:
 
 
 # --- the page ---
-
-_STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;color:#1c2530;margin:0;background:#f4f6f8}
-main{max-width:1080px;margin:0 auto;padding:24px}
-h1{font-size:26px;margin:0 0 4px}h2{font-size:19px;margin:32px 0 8px}
-p.lead{margin:0 0 20px;color:#55606c}
-.cards{display:grid;grid-template-columns:repeat(auto-fit,minmax(220px,1fr));gap:12px}
-.card{background:#fff;border:1px solid #e0e5ea;border-radius:8px;padding:12px 14px}
-.card b{display:block;font-size:24px;line-height:1.25;font-variant-numeric:tabular-nums}
-.card span{font-size:13px;color:#55606c}.card.bad{border-color:#c8322b;background:#fdf1f0}
-img{max-width:100%;height:auto;display:block;margin:0 auto;background:#fff;border-radius:8px}
-figure{margin:0 0 20px;background:#fff;border:1px solid #e0e5ea;border-radius:8px;padding:10px}
-figcaption{font-size:13px;color:#55606c;margin-top:6px;font-variant-numeric:tabular-nums}
-.pair{display:grid;grid-template-columns:1fr 1fr 1fr;gap:6px}
-.pair span{font-size:12px;color:#55606c}
-table{border-collapse:collapse;background:#fff;font-size:14px;font-variant-numeric:tabular-nums}
-td,th{padding:4px 14px 4px 8px;border-bottom:1px solid #e9edf1;text-align:left}
-.bad td{color:#c8322b}
-"""
 
 # name, label, unit, factor, digits
 _CARDS = (
@@ -297,41 +258,28 @@ _CARDS = (
 )
 
 
-def _page(drive: Drive, pictures: Mapping[str, bytes]) -> str:
+def _page(drive: Drive, plots: Mapping[str, bytes]) -> str:
     failed = {line.split(" ")[0] for line in missed(drive.figures, drive.limits)}
+    lead = (
+        f"{int(drive.figures['accepted'])} of {int(drive.figures['processed'])} "
+        f"processed frames localized, {int(drive.figures['sent'])} images played."
+    )
     parts = [
-        "<!doctype html><html lang=en><meta charset=utf-8>",
-        "<meta name=viewport content='width=device-width,initial-scale=1'>",
-        f"<title>{html.escape(drive.title)}</title><style>{_STYLE}</style><main>",
-        f"<h1>{html.escape(drive.title)}</h1>",
-        f"<p class=lead>{int(drive.figures['accepted'])} of {int(drive.figures['processed'])} "
-        f"processed frames localized, {int(drive.figures['sent'])} images played.</p>",
-        _cards(drive.figures, failed),
+        cards(drive.figures, _CARDS, failed),
         "<h2>Trajectory</h2>",
-        _picture(pictures["trajectory"], "Grey: the map's Gaussians around camera height."),
+        plot(plots["trajectory"], "Grey: the map's Gaussians around camera height."),
         "<h2>Error over time</h2>",
-        _picture(pictures["errors"], "Against the recording's true poses."),
+        plot(plots["errors"], "Against the recording's true poses."),
         "<h2>Latency and memory</h2>",
-        _picture(pictures["latency"], "Stages as the localizer measured them, stacked."),
+        plot(plots["latency"], "Stages as the localizer measured them, stacked."),
         "<h2>What the camera saw, and what the map shows from the pose found</h2>",
         *[_overlay(overlay) for overlay in drive.overlays],
         "<h2>All figures</h2>",
-        _table({k: _number(v) for k, v in drive.figures.items()}, failed),
+        facts_table({k: number(v) for k, v in drive.figures.items()}, failed),
         "<h2>What was run</h2>",
-        _table(drive.facts, set()),
-        "</main></html>",
+        facts_table(drive.facts),
     ]
-    return "\n".join(parts)
-
-
-def _cards(figures: Mapping[str, float], failed: set[str]) -> str:
-    cards = []
-    for name, label, unit, factor, digits in _CARDS:
-        value = figures.get(name, math.nan) * factor
-        text = f"{value:.{digits}f}&nbsp;{unit}" if math.isfinite(value) else "–"
-        kind = "card bad" if name in failed else "card"
-        cards.append(f"<div class='{kind}'><b>{text}</b><span>{label}</span></div>")
-    return f"<div class=cards>{''.join(cards)}</div>"
+    return page(drive.title, lead, parts)
 
 
 def _overlay(overlay: Overlay) -> str:
@@ -339,39 +287,4 @@ def _overlay(overlay: Overlay) -> str:
     angle_deg, distance_m = frame.error
     error = f", error {distance_m * 100:.2f} cm and {angle_deg:.3f}°" if distance_m >= 0 else ""
     caption = f"t = {frame.time_s:.1f} s: {frame.inliers} inliers{error}"
-    images = (
-        ("camera", overlay.live), ("map at the pose found", overlay.render),
-        ("both in alternate tiles", overlay.checkered()),
-    )  # fmt: skip
-    cells = []
-    for label, image in images:
-        _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
-        source = _data_url(data.tobytes(), "jpeg")
-        cells.append(f"<div><img src='{source}' alt='{label}'><span>{label}</span></div>")
-    return _framed(f"<div class=pair>{''.join(cells)}</div>", caption)
-
-
-def _picture(data: bytes, caption: str) -> str:
-    return _framed(f"<img src='{_data_url(data, 'png')}' alt=''>", caption)
-
-
-def _framed(content: str, caption: str) -> str:
-    return f"<figure>{content}<figcaption>{caption}</figcaption></figure>"
-
-
-def _data_url(data: bytes, kind: str) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
-
-
-def _table(rows: Mapping[str, str], failed: set[str]) -> str:
-    lines = []
-    for name, value in rows.items():
-        kind = " class=bad" if name in failed else ""
-        lines.append(f"<tr{kind}><td>{html.escape(name)}</td><td>{html.escape(value)}</td></tr>")
-    return f"<table>{''.join(lines)}</table>"
-
-
-def _number(value: float) -> str:
-    if not math.isfinite(value):
-        return "–"
-    return str(int(value)) if value == int(value) else f"{value:.4g}"
+    return pictures(overlay.labelled(), caption)

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from igaussian_core.camera import Camera
 from igaussian_core.errors import DatasetError
-from igaussian_core.evaluate.metrics import QueryOutcome, outcome
-from igaussian_core.localizer import Localizer
+from igaussian_core.evaluate.image_changes import Change, changed
+from igaussian_core.geometry import Sim3
 from igaussian_core.posed_images import PosedImage, read_posed_images
+
+Array = NDArray[np.float64]
 
 
 def held_out_images(
@@ -27,7 +32,7 @@ def held_out_images(
         DatasetError: no list of training photos (and not allow_training), or nothing is left.
     """
     images = [image for image in read_posed_images(poses) if image.path.is_file()]
-    note = Path(map_note) if map_note else _beside(Path(poses)) / "map.json"
+    note = Path(map_note) if map_note else folder_of(poses) / "map.json"
     if not allow_training:
         if not note.is_file():
             raise DatasetError(
@@ -49,27 +54,48 @@ def _trained_on(note: Path) -> set[str]:
         raise DatasetError(f"{note}: names no photos under 'trained_on' ({cause})") from error
 
 
+def folder_of(poses: str | Path) -> Path:
+    """Where a pose file lies; a folder of poses itself."""
+    path = Path(poses)
+    return path if path.is_dir() else path.parent
+
+
 def extent(images: Sequence[PosedImage]) -> float:
     """Largest distance of a camera from the cameras' mean position, scene units."""
     positions = np.array([image.T_scene_cam[:3, 3] for image in images])
     return float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
 
 
-def evaluate_photos(
-    localizer: Localizer,
-    images: Sequence[PosedImage],
-    progress: Callable[[int, int], None] = lambda done, of: None,
-) -> list[QueryOutcome]:
-    """Localize every image without a prior; the truth is looked at afterwards only."""
-    red, green, blue = (round(255 * value) for value in localizer.manifest.background)
-    outcomes = []
-    for index, image in enumerate(images):
-        result = localizer.localize(image.read((red, green, blue)), image.camera)
-        truth = localizer.T_map_scene.camera(image.T_scene_cam)
-        outcomes.append(outcome(image.name, result, truth))
-        progress(index + 1, len(images))
-    return outcomes
+@dataclass(frozen=True)
+class PhotoQueries:
+    """Photos of a map's scene.
 
+    Attributes:
+        background: RGB in [0, 1], behind photos with an alpha channel.
+        changes: of the images.
+    """
 
-def _beside(path: Path) -> Path:
-    return path if path.is_dir() else path.parent
+    images: tuple[PosedImage, ...]
+    T_map_scene: Sim3
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    changes: tuple[Change, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def name(self, index: int) -> str:
+        return self.images[index].name
+
+    def group(self, index: int) -> str:
+        return ""
+
+    def image(self, index: int) -> tuple[NDArray[np.uint8], Camera]:
+        red, green, blue = (round(255 * value) for value in self.background)
+        photo = self.images[index]
+        return changed(photo.read((red, green, blue)), self.changes, index), photo.camera
+
+    def prior(self, index: int) -> Array | None:
+        return None
+
+    def truth(self, index: int) -> Array:
+        return self.T_map_scene.camera(self.images[index].T_scene_cam)

@@ -24,7 +24,7 @@ CORE = Path(igaussian_core.__file__).parent
 LAYERS = [
     ["errors"],
     ["config", "geometry", "camera", "camera_info", "image_decode", "timing", "result",
-     "hypothesis", "frame", "resources", "worker", "contrast"],
+     "hypothesis", "frame", "resources", "worker", "contrast", "tum"],
     ["render", "posed_images", "bag_storage", "bags", "formats", "colour",
      "pictures"],
     ["gaussian_map"],
@@ -35,6 +35,8 @@ LAYERS = [
     ["coarse", "refine"],
     ["localizer"],
     ["tracker", "replay", "compile_map", "train", "evaluate"],
+    ["cli_tools"],
+    ["cli_eval"],
     ["cli"],
 ]  # fmt: skip
 LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -46,7 +46,7 @@ def _frames(poses: list[np.ndarray], lost: tuple[int, ...] = (4,)) -> list[Drive
 def _drive(frames: list[DriveFrame], poses: list[np.ndarray], **limits: float) -> Drive:
     memory = [MemorySample(0.5 * i, 300.0) for i in range(10)]
     picture = np.full((48, 64, 3), 90, np.uint8)
-    overlays = [Overlay(frames[0], picture, picture + 60)]
+    overlays = [Overlay(picture, picture + 60, frames[0])]
     truth = Trajectory([(START + i * STEP, T) for i, T in enumerate(poses)])
     points = np.random.default_rng(0).normal(0, 3, (5000, 3)).astype(np.float32)
     figures = summarize_drive(frames, 25, memory)
@@ -126,7 +126,7 @@ def test_plan_of_upright_and_of_turned_maps() -> None:
 def test_overlay_tiles_alternate() -> None:
     frame = _frames(_poses())[0]
     live, render = np.zeros((16, 16, 3), np.uint8), np.full((16, 16, 3), 255, np.uint8)
-    overlay = Overlay(frame, live, render)
+    overlay = Overlay(live, render, frame)
     assert overlay.side_by_side().shape == (16, 32, 3)
     tiles = overlay.checkered(4)[::4, ::4, 0]
     expected = np.indices((4, 4)).sum(0) % 2 * 255

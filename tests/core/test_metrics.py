@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+
 import numpy as np
 import pytest
 
 from igaussian_core.evaluate.metrics import (
     QueryOutcome,
+    area_under_recall,
+    by_group,
+    from_json,
     normalized_error_squared,
     outcome,
+    recall_curve,
+    stage_times,
     summarize,
+    to_json,
 )
 from igaussian_core.geometry import compose, rotation_from_quaternion, rotation_from_vector
 from igaussian_core.result import LocalizationResult, Status
@@ -141,3 +150,68 @@ def test_all_lost() -> None:
     s = summarize([LOST, LOST], 5, 0.5)
     assert s["accepted"] == s["success"] == s["wrong_accepted"] == 0
     assert np.isinf(s["median_deg"]) and np.isnan(s["max_deg"]) and np.isnan(s["median_nees"])
+
+
+def test_means_run_over_accepted_poses() -> None:
+    s = summarize([some(1, 0.1, nees=4), some(3, 0.3, nees=20), LOST], 5, 0.5)
+    assert s["mean_deg"] == pytest.approx(2) and s["mean_distance"] == pytest.approx(0.2)
+    assert s["mean_nees"] == pytest.approx(12) and s["inside_95"] == 0.5
+
+
+def test_shares_within_the_papers_thresholds_count_the_lost() -> None:
+    s = summarize([some(15, 0.5), some(15.1, 0.4), some(1, 0.6), LOST], 5, 0.5)
+    assert s["within_15_deg"] == 0.5 and s["within_half_unit"] == 0.5
+
+
+def test_area_under_the_recall_curve() -> None:
+    """By hand: the step function's exact area, nothing for what is beyond the limit."""
+    assert area_under_recall(np.array([0.0, 0.0]), 5.0) == 1
+    assert area_under_recall(np.array([2.5, 2.5]), 5.0) == 0.5
+    assert area_under_recall(np.array([1.0, 4.0, 7.0, np.inf]), 5.0) == pytest.approx(0.25)
+    assert np.isnan(area_under_recall(np.array([]), 5.0))
+    x, y = recall_curve(np.array([1.0, 4.0, 7.0, np.inf]), 5.0)
+    under_steps = np.sum(np.diff(x) * y[:-1]) / 5.0
+    assert under_steps == pytest.approx(0.25)
+    assert (x[-1], y[-1]) == (5.0, 0.5)
+
+
+def test_joint_area_takes_the_worse_of_both() -> None:
+    s = summarize([some(1.0, 0.4)], 5, 0.5)  # 0.2 and 0.8 of the limits
+    assert s["auc"] == pytest.approx(0.2)
+    assert s["auc_deg"] == pytest.approx(0.8) and s["auc_distance"] == pytest.approx(0.2)
+
+
+def test_rotation_alone() -> None:
+    s = summarize([some(1.0, 7.0), some(9.0, 0.0), LOST], 5, float("inf"))
+    assert s["success"] == pytest.approx(1 / 3) and s["wrong_accepted"] == 1
+    assert s["auc"] == s["auc_deg"] == pytest.approx(0.8 / 3)
+
+
+def test_stage_times_count_who_went_through() -> None:
+    def timed(**ms: float) -> QueryOutcome:
+        return dataclasses.replace(some(1, 1), timings_ms=ms)
+
+    times = stage_times([timed(a=1.0, total=3.0), timed(a=3.0, b=8.0, total=11.0)])
+    assert list(times) == ["a", "b", "total"]
+    assert times["a"]["median_ms"] == 2 and times["a"]["queries"] == 2
+    assert times["b"]["median_ms"] == 8 and times["b"]["queries"] == 1
+    assert times["total"]["mean_ms"] == 7
+
+
+def test_groups_keep_their_order() -> None:
+    outcomes = [dataclasses.replace(some(1, 1), group=g) for g in ("b", "a", "b")]
+    assert {k: len(v) for k, v in by_group(outcomes).items()} == {"b": 2, "a": 1}
+
+
+@pytest.mark.parametrize("result", [
+    accepted(TRUE, np.eye(6)), LocalizationResult(Status.INCONSISTENT, "why"),
+])  # fmt: skip
+def test_an_outcome_survives_strict_json(result: LocalizationResult) -> None:
+    before = outcome("q", result, TRUE, "bin")
+    text = json.dumps(to_json(before), allow_nan=False)
+    after = from_json(json.loads(text))
+    for name in ("name", "group", "status", "angle_deg", "distance", "coarse_angle_deg"):
+        assert getattr(after, name) == getattr(before, name)
+    np.testing.assert_equal(after.nees, before.nees)
+    np.testing.assert_array_equal(after.T_map_cam_true, TRUE)
+    assert (after.T_map_cam is None) == (before.T_map_cam is None)

@@ -11,7 +11,8 @@ import pytest
 import room
 
 from igaussian_core.errors import DatasetError
-from igaussian_core.evaluate.photos import evaluate_photos, extent, held_out_images
+from igaussian_core.evaluate.photos import PhotoQueries, extent, held_out_images
+from igaussian_core.evaluate.runner import run
 from igaussian_core.gaussian_map import GaussianMap
 from igaussian_core.localizer import Localizer
 from igaussian_core.posed_images import read_posed_images
@@ -67,7 +68,8 @@ def test_extent(photos: Path) -> None:
 def test_photos_are_localized_and_compared(photos: Path, localizer: Localizer) -> None:
     steps: list[tuple[int, int]] = []
     images = held_out_images(photos, None, allow_training=True)
-    outcomes = evaluate_photos(localizer, images, lambda *step: steps.append(step))
+    queries = PhotoQueries(tuple(images), localizer.T_map_scene)
+    outcomes = run(lambda: localizer, queries, progress=lambda *s: steps.append(s)).outcomes
     assert [o.name for o in outcomes] == ["0.png", "1.png", "2.png"]
-    assert steps == [(1, 3), (2, 3), (3, 3)]
+    assert steps == [(0, 3), (1, 3), (2, 3), (3, 3)]
     assert all(o.angle_deg < 0.15 and o.distance < 0.004 for o in outcomes)
