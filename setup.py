@@ -113,8 +113,8 @@ DEPENDENCIES = [
     "kornia>=0.8.2,<0.9; python_version < '3.11'",
     "matplotlib>=3.10,<4",
     "mcap>=1.2,<2",
-    "numpy>=2.0,<3",
-    "opencv-python-headless>=4.10,<6",
+    "numpy>=1.26,<3",
+    "opencv-python-headless>=4.11,<6",
     "plyfile>=1.1,<2",
     "poselib>=2.0.5,<3",
     "rich>=14,<16",
@@ -129,10 +129,15 @@ DEPENDENCIES = [
 EXTRAS = {
     # a machine with a ROS 2 installation has these already, under names that PyPI gives to others
     "ros": ["ros-jazzy-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces==5.3.6"],
+    # ATE and RPE of `igaussian eval bag`
+    "eval": ["evo>=1.31,<2"],
+    # peers that benchmarks/peers.py compares with
+    "bench": ["pycolmap>=3.12,<5"],
     "test": [
         "colcon-core>=0.20,<1",
         "colcon-python-setup-py>=0.2.9,<1",
         "colcon-ros>=0.5,<1",
+        "evo>=1.31,<2",
         "hypothesis>=6.100,<7",
         "mypy>=1.15,<3",
         "pytest>=8.3,<10",

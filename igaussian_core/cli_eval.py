@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.table import Table
 
@@ -185,6 +186,95 @@ def eval_photos(
     for o in evaluation.outcomes:
         if not (o.angle_deg < max_deg and o.distance < limit):
             console.print(f"  {o.name}: {o.status}, {o.angle_deg:.2f} deg, {o.distance:.3g}")
+
+
+@eval_app.command("bag")
+def eval_bag(
+    bag: Annotated[Path, typer.Argument(help=".mcap, rosbag2 directory or ROS 1 .bag")],
+    map_path: MapOption,
+    truth: Annotated[str | None, typer.Option(help="topic of the true camera poses")] = None,
+    rate: Annotated[float, typer.Option(help="2 plays twice as fast", min=0.01)] = 1.0,
+    duration: Annotated[
+        float | None, typer.Option(help="seconds of the recording", min=0.1)
+    ] = None,
+    every_frame: Annotated[
+        bool, typer.Option(help="process every frame, however long it takes")
+    ] = False,
+    image_topic: Annotated[str | None, typer.Option(help="default: found")] = None,
+    camera_info_topic: Annotated[str | None, typer.Option(help="default: found")] = None,
+    json_out: JsonOption = None,
+    report: ReportOption = None,
+    tum: TumOption = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+) -> None:
+    """Localize a recording frame after frame: ATE, RPE, latency, dropped images."""
+    from igaussian_core.bags import Bag
+    from igaussian_core.evaluate.drive import Trajectory, summarize_drive
+    from igaussian_core.evaluate.drive_overlays import make_overlays
+    from igaussian_core.evaluate.drive_report import Drive, drive_page
+    from igaussian_core.evaluate.drive_run import run_drive
+    from igaussian_core.evaluate.metrics import plain
+    from igaussian_core.evaluate.report import machine_facts, write_text
+    from igaussian_core.evaluate.trajectory_errors import trajectory_errors
+    from igaussian_core.map_package import open_package
+    from igaussian_core.tum import write_tum
+
+    configuration = load_config(config, set_)
+    localizer = _open_warm(map_path, configuration)
+    topics = (image_topic, camera_info_topic)
+    with Bag(bag) as recording, progress_bars() as progress:
+        true = Trajectory(recording.poses(truth))
+        images = recording.topics[image_topic or recording.image_topic()].count
+        stages = Stages(progress)
+        seen: list[Any] = []
+
+        def show(frame: Any) -> None:
+            seen.append(frame)
+            stages("frames", len(seen), images)
+
+        run = run_drive(
+            recording, localizer, configuration, true, rate, duration, every_frame, show, topics
+        )
+    judged = [
+        (f.T_map_cam, f.T_map_cam_true, f.stamp_ns * 1e-9)
+        for f in run.frames
+        if f.T_map_cam is not None and f.T_map_cam_true is not None
+    ]
+    figures = {
+        **summarize_drive(run.frames, len(run.frames) + run.dropped, run.memory),
+        "dropped": float(run.dropped),
+        **trajectory_errors(judged),
+    }
+    table = Table(title=f"{bag}: {len(judged)} poses judged", show_header=False)
+    for name, value in figures.items():
+        table.add_row(name, f"{value:.4g}")
+    console.print(table)
+    facts = {
+        "recording": str(bag), "map": str(map_path), "replay rate": f"{rate:g}",
+        "every frame": str(every_frame), **machine_facts(),
+    }  # fmt: skip
+    if json_out is not None:
+        document = {
+            "track": "bag", "facts": facts, "summary": plain(figures),
+            "config": dataclasses.asdict(configuration),
+        }  # fmt: skip
+        write_text(json_out, json.dumps(document, indent=1) + "\n")
+    if tum is not None:
+        write_tum(
+            tum, ((f.stamp_ns * 1e-9, f.T_map_cam) for f in run.frames if f.T_map_cam is not None)
+        )
+    if report is not None:
+        with Bag(bag) as recording:
+            overlays = make_overlays(recording, localizer, run.frames, 6, topics=topics)
+        package = open_package(map_path)
+        points = package.T_map_scene.points(package.gaussians.means).astype(np.float32)
+        drive = Drive(
+            f"iGaussian: {bag.name}", figures, run.frames, true, run.memory, points, overlays, {},
+            facts,
+        )  # fmt: skip
+        write_text(report, drive_page(drive))
+        console.print(f"report: {report}")
 
 
 @dataclasses.dataclass(frozen=True)

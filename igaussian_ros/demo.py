@@ -32,12 +32,13 @@ from igaussian_core.errors import IGaussianError
 from igaussian_core.evaluate.drive import DriveFrame, MemorySample, Trajectory, summarize_drive
 from igaussian_core.evaluate.drive_overlays import make_overlays
 from igaussian_core.evaluate.drive_recording import write_recording
-from igaussian_core.evaluate.drive_report import Drive, missed, plain, write_report
+from igaussian_core.evaluate.drive_report import Drive, missed, write_report
+from igaussian_core.evaluate.drive_run import run_drive
+from igaussian_core.evaluate.metrics import plain
 from igaussian_core.features import make_matcher
 from igaussian_core.gaussian_map import file_sha256
 from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import open_package
-from igaussian_core.replay import ReplayedFrame, replay
 from igaussian_core.resources import resource
 
 # what the bundled drive has to reach; a drive of one's own is only reported
@@ -234,34 +235,12 @@ def ride_without_ros(
 ) -> Ride:
     """The recording through NewestFrameWorker and Tracker in this process."""
     localizer = Localizer.open(map_path, options.config)
-    frames: list[DriveFrame] = []
-    memory: list[MemorySample] = []
-
-    def keep(replayed: ReplayedFrame) -> None:
-        result, stamp_ns = replayed.result, replayed.frame.stamp_ns
-        first_ns = frames[0].stamp_ns if frames else stamp_ns
-        latency_ms = replayed.latency_ms if result.T_map_cam is not None else float("nan")
-        frame = DriveFrame(
-            stamp_ns, (stamp_ns - first_ns) * 1e-9, result.status.value, result.reason,
-            result.T_map_cam, truth.at(stamp_ns), result.inliers, latency_ms,
-            replayed.finished_s, result.timings_ms,
-        )  # fmt: skip
-        frames.append(frame)
-        memory.append(MemorySample(replayed.finished_s, resident_mb(os.getpid())))
-        on_frame(frame)
-
     with Bag(bag_path) as bag:
-        replay(bag, localizer, options.config, keep, options.rate, options.duration_s)
-    return Ride(frames, memory, "without ROS, in one process")
-
-
-def resident_mb(pid: int) -> float:
-    """Resident memory of a process in MB; NaN where the system does not say."""
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    except (OSError, ValueError, IndexError):
-        return float("nan")
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+        run = run_drive(
+            bag, localizer, options.config, truth, options.rate, options.duration_s,
+            on_frame=on_frame,
+        )  # fmt: skip
+    return Ride(run.frames, run.memory, "without ROS, in one process")
 
 
 # --- what is shown ---

@@ -22,10 +22,11 @@ from rich.console import Console
 from igaussian_core.bags import IMAGE, ODOMETRY, Bag
 from igaussian_core.errors import IGaussianError
 from igaussian_core.evaluate.drive import DriveFrame, MemorySample, Trajectory
+from igaussian_core.evaluate.drive_run import resident_mb
 from igaussian_core.replay import camera_mounting
 from igaussian_core.resources import resource
 from igaussian_core.result import Status
-from igaussian_ros.demo import DemoOptions, Ride, resident_mb
+from igaussian_ros.demo import DemoOptions, Ride
 
 if TYPE_CHECKING:  # the middleware reads its environment when it is imported
     from igaussian_ros.listener import HeardStatus, Listener

@@ -63,11 +63,7 @@ class Drive:
 def write_report(drive: Drive, folder: Path) -> Path:
     """Write report.html, its pictures as PNG and summary.json into a folder; the page's path."""
     folder.mkdir(parents=True, exist_ok=True)
-    plots = {
-        "trajectory": png(_trajectory_figure(drive)),
-        "errors": png(_error_figure(drive)),
-        "latency": png(_latency_figure(drive)),
-    }
+    plots = _plots(drive)
     for name, data in plots.items():
         (folder / f"{name}.png").write_bytes(data)
     for old in folder.glob("overlay_*.png"):
@@ -79,6 +75,19 @@ def write_report(drive: Drive, folder: Path) -> Path:
     page = folder / "report.html"
     page.write_text(_page(drive, plots), encoding="utf-8")
     return page
+
+
+def drive_page(drive: Drive) -> str:
+    """The page alone, as HTML."""
+    return _page(drive, _plots(drive))
+
+
+def _plots(drive: Drive) -> dict[str, bytes]:
+    return {
+        "trajectory": png(_trajectory_figure(drive)),
+        "errors": png(_error_figure(drive)),
+        "latency": png(_latency_figure(drive)),
+    }
 
 
 def missed(figures: Mapping[str, float], limits: Mapping[str, float]) -> list[str]:

@@ -14,10 +14,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import room
+from typer.testing import CliRunner
 
+from igaussian_core.bags import Bag
 from igaussian_core.camera import Camera
+from igaussian_core.cli_eval import eval_app
 from igaussian_core.config import Config
 from igaussian_core.errors import ConfigError
+from igaussian_core.evaluate.drive import Trajectory
+from igaussian_core.evaluate.drive_run import run_drive
 from igaussian_core.evaluate.image_changes import changed, changed_colours, parse_change
 from igaussian_core.evaluate.metrics import QueryOutcome
 from igaussian_core.evaluate.photos import PhotoQueries
@@ -32,11 +37,14 @@ from igaussian_core.evaluate.rendered import (
 )
 from igaussian_core.evaluate.report import Evaluation, write_csv, write_html, write_json
 from igaussian_core.evaluate.runner import Estimator, Partial, Queries, run
+from igaussian_core.evaluate.trajectory_errors import trajectory_errors
 from igaussian_core.gaussian_map import GaussianMap
 from igaussian_core.geometry import Sim3, pose_error
 from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import open_package
 from igaussian_core.result import LocalizationResult, Status
+from igaussian_core.tum import read_tum
+from igaussian_core.views import look_at
 
 OBJECT, SCENE = Sphere("object", 4.0, (0.1, 0.2, 0.3)), Sphere("scene", 0.1)
 
@@ -315,3 +323,78 @@ def test_the_report_needs_no_other_file(
 def test_queries_fit_the_protocol(queries: RenderedQueries) -> None:
     sets: list[Queries] = [queries, PhotoQueries((), Sim3.identity())]
     assert [len(s) for s in sets] == [6, 0]
+
+
+# --- trajectories ---
+
+
+def circle(count: int = 20) -> list[np.ndarray]:
+    return [look_at([np.cos(a), np.sin(a), 1.0], [0, 0, 1.0]) for a in np.linspace(0, 3, count)]
+
+
+def stamped(estimated: list[np.ndarray], true: list[np.ndarray]) -> list:  # type: ignore[type-arg]
+    return [(e, t, 100 + 0.1 * i) for i, (e, t) in enumerate(zip(estimated, true, strict=True))]
+
+
+def test_ate_of_a_shifted_trajectory() -> None:
+    """A constant shift is an absolute error, but none after alignment and none of motion."""
+    true = circle()
+    moved = [T.copy() for T in true]
+    for T in moved:
+        T[:3, 3] += [0.03, 0.0, 0.04]
+    errors = trajectory_errors(stamped(moved, true))
+    assert [errors["ate_rmse_m"], errors["ate_max_m"]] == pytest.approx([0.05, 0.05])
+    assert errors["ate_aligned_rmse_m"] < 1e-9
+    assert errors["rpe_rmse_m"] < 1e-9 and errors["rpe_rmse_deg"] < 1e-3
+
+
+def test_a_mirrored_trajectory_is_wrong() -> None:
+    true = circle()
+    mirrored = [T.copy() for T in true]
+    for T in mirrored:
+        T[1, 3] *= -1
+    assert trajectory_errors(stamped(mirrored, true))["ate_rmse_m"] > 1
+    assert math.isnan(trajectory_errors(stamped(true[:2], true[:2]))["ate_rmse_m"])
+
+
+def test_rpe_of_a_jump() -> None:
+    true = circle(11)
+    jumped = [T.copy() for T in true]
+    for T in jumped[5:]:
+        T[2, 3] += 0.1
+    # one of ten motions is wrong by 0.1
+    assert trajectory_errors(stamped(jumped, true))["rpe_rmse_m"] == pytest.approx(
+        0.1 / math.sqrt(10)
+    )
+
+
+def test_a_recording_is_judged(repo_root: Path, localizer: Localizer) -> None:
+    """The bundled drive in a map of another room: frames are processed, none is accepted."""
+    path = repo_root / "bags" / "demo" / "drive"
+    with Bag(path) as bag:
+        truth = Trajectory(bag.poses(None))
+        run = run_drive(bag, localizer, Config(), truth, duration_s=0.4, every_frame=True)
+    assert 3 <= len(run.frames) <= 6 and run.dropped == 0
+    assert all(f.T_map_cam is None and f.T_map_cam_true is not None for f in run.frames)
+    assert all(m.rss_mb > 100 for m in run.memory)
+
+
+def test_the_command_writes_everything(room_igmap: Path, tmp_path: Path) -> None:
+    def evaluate(*words: object) -> str:
+        arguments = ["rendered", "--map", room_igmap, "--targets", 1, "--translation", 0.1, *words]
+        answer = CliRunner().invoke(eval_app, [str(word) for word in arguments])
+        assert answer.exit_code == 0, answer.output
+        return answer.output
+
+    files = {name: tmp_path / name for name in ("json", "csv", "report", "tum", "results")}
+    options = [word for name, path in files.items() for word in (f"--{name}", path)]
+    assert "success" in evaluate(*options, "--change", "gain=0.8")
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(files)  # no partial file is left
+    data = json.loads(files["json"].read_text())
+    assert data["facts"]["changes"] == "paper, gain=0.8"
+    assert len(read_tum(files["tum"])) == data["summary"]["accepted"] >= 2
+    assert len(files["results"].read_text().splitlines()) == data["summary"]["accepted"]
+    turned = evaluate("--rotation-only", "--exact-colours", "--json", files["json"])
+    assert "wherever" in turned
+    data = json.loads(files["json"].read_text())
+    assert data["thresholds"]["distance"] is None and data["facts"]["changes"] == "none"
