@@ -161,11 +161,17 @@ class Camera:
         if self.model == "equidistant" and self.dist:
             result = cv2.fisheye.undistortPoints(points, self.K, np.array(self.dist))
         else:
-            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
-            result = cv2.undistortPoints(
-                points, self.K, np.array(self.dist), None, None, criteria=criteria
-            )
+            result = _undistort_points(points, self.K, np.array(self.dist))
         return np.asarray(result, np.float64).reshape(-1, 2)
+
+
+def _undistort_points(
+    points: NDArray[np.float64], K: NDArray[np.float64], dist: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+    if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4
+        return np.asarray(cv2.undistortPointsIter(points, K, dist, None, None, criteria))
+    return np.asarray(cv2.undistortPoints(points, K, dist, None, None, criteria=criteria))
 
 
 @functools.lru_cache(maxsize=8)

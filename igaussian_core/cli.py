@@ -371,7 +371,7 @@ def localize(
     config: ConfigOption = None,
     set_: SetOption = None,
 ) -> None:
-    """Where was a photo taken? Exit code 2 where that cannot be said."""
+    """Where was a photo taken? Exit code 3 where that cannot be said."""
     from igaussian_core.camera import Camera
     from igaussian_core.geometry import compose, rotation_from_quaternion
     from igaussian_core.localizer import Localizer
@@ -395,7 +395,7 @@ def localize(
     else:
         _print_result(result)
     if not result.ok:
-        raise typer.Exit(2)
+        raise typer.Exit(3)
 
 
 def result_json(result: Any) -> dict[str, Any]:

@@ -113,8 +113,8 @@ def _write_mp4(path: Path, frames: Iterator[Image], frames_per_second: float) ->
 
 
 def _write_gif(path: Path, frames: Iterator[Image], frames_per_second: float) -> int:
-    if not hasattr(cv2, "imwriteanimation"):
-        raise ImageError(f"{path}: this OpenCV ({cv2.__version__}) writes no .gif; 4.11 does")
+    if not cv2.haveImageWriter(str(path)):
+        raise ImageError(f"{path}: this OpenCV ({cv2.__version__}) writes no .gif; 4.12 does")
     animation = cv2.Animation()
     # four channels: the encoder takes no others
     animation.frames = [cv2.cvtColor(frame, cv2.COLOR_RGB2BGRA) for frame in frames]

@@ -47,7 +47,7 @@ def test_a_shift_is_found_to_a_tenth_of_a_pixel(dx: float, dy: float) -> None:
     image = texture()
     motion, share = tracked(image, moved(image, dx, dy))
     assert share > 0.85 and len(motion) > 80
-    assert np.abs(np.median(motion, axis=0) - [dx, dy]).max() < 0.05
+    assert np.abs(np.median(motion, axis=0) - [dx, dy]).max() < 0.1
     assert (np.linalg.norm(motion - [dx, dy], axis=1) < 0.2).mean() > 0.9
 
 
