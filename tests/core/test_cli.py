@@ -274,17 +274,17 @@ def test_localize_with_a_prior_and_settings(
     assert ran.code == 0 and json.loads(ran.out)["source"] == "prior"
 
 
-def test_lost_is_exit_code_two_and_valid_json(
+def test_lost_is_exit_code_three_and_valid_json(
     igaussian: Command, room_igmap: Path, tmp_path: Path
 ) -> None:
     cv2.imwrite(str(tmp_path / "black.png"), np.zeros((240, 320, 3), np.uint8))
     ran = localize(igaussian, tmp_path / "black.png", room_igmap, "--json")
-    assert ran.code == 2
+    assert ran.code == 3
     result = json.loads(ran.out, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
     assert result["ok"] is False and result["T_map_cam"] is None
     assert result["status"] == "too_dark_or_blurred" and result["residual_px"] is None
     people = localize(igaussian, tmp_path / "black.png", room_igmap)
-    assert people.code == 2 and "too_dark_or_blurred" in people.out
+    assert people.code == 3 and "too_dark_or_blurred" in people.out
 
 
 @pytest.mark.parametrize(
