@@ -210,14 +210,10 @@ void project(const Model& model, const View& view, int64_t super_block, Splat* s
         std::memcpy(&depth, &s->z, 4);
         const uint64_t key = static_cast<uint64_t>(depth) << 32 | (first_splat + count);
         ++count;
-        const int first = lanes.y0[l] * bins->tiles_x + lanes.x0[l];
-        const int last = lanes.y1[l] * bins->tiles_x + lanes.x1[l];
-        file(bins, first, key);
-        if (first == last) continue;
-        const int wide = lanes.x1[l] - lanes.x0[l];
-        for (int x = first + 1; x <= first + wide; ++x) file(bins, x, key);
-        for (int row = first + bins->tiles_x; row <= last; row += bins->tiles_x) {
-          for (int x = row; x <= row + wide; ++x) file(bins, x, key);
+        for (int y = lanes.y0[l]; y <= lanes.y1[l]; ++y) {
+          for (int x = lanes.x0[l]; x <= lanes.x1[l]; ++x) {
+            file(bins, y * bins->tiles_x + x, key);
+          }
         }
       }
     }
