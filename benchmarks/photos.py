@@ -36,7 +36,8 @@ CASES = (
 )
 COLUMNS = (
     "| set | queries | within 5 deg and 5 % of the extent | median | p90 | coarse, median "
-    "| mean NEES | ms, median |\n|---|---|---|---|---|---|---|---|"
+    "| mean NEES | fewest inliers, lowest ratio | ms, median |\n"
+    "|---|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -79,17 +80,21 @@ def _localized(localizer: Localizer, images: list[PosedImage]) -> list[QueryOutc
 
 def _row(name: str, s: dict[str, float], outcomes: list[QueryOutcome]) -> str:
     nees = [o.nees for o in outcomes if math.isfinite(o.nees)]
+    accepted = [o for o in outcomes if o.accepted]
     return (
         f"| {name} | {s['queries']:.0f} | {s['success']:.1%} "
         f"| {s['median_deg']:.3f} deg, {s['median_distance']:.4f} "
         f"| {s['p90_deg']:.2f} deg, {s['p90_distance']:.4f} "
         f"| {s['coarse_median_deg']:.2f} deg, {s['coarse_median_distance']:.3f} "
-        f"| {sum(nees) / max(len(nees), 1):.1f} | {s['median_ms']:.0f} |"
+        f"| {sum(nees) / max(len(nees), 1):.1f} "
+        f"| {min(o.inliers for o in accepted)}, {min(o.inlier_ratio for o in accepted):.2f} "
+        f"| {s['median_ms']:.0f} |"
     )
 
 
 def _cross_scene(work: Path) -> list[dict[str, object]]:
-    print("\n| map | photos of other scenes | accepted | most inliers |\n|---|---|---|---|")
+    print("\n| map | photos of other scenes | accepted | most inliers | its ratio |")
+    print("|---|---|---|---|---|")
     rows = []
     queries = {name: _some_photos(name) for name in
                ("fox", "flower", "fern", "redkitchen", "lego", "shelf", "desk5")}  # fmt: skip
@@ -99,9 +104,11 @@ def _cross_scene(work: Path) -> list[dict[str, object]]:
         others = [image for other, images in queries.items() if other != data_set
                   for image in images]  # fmt: skip
         results = [localizer.localize(image.read(), image.camera) for image in others]
-        accepted, most = sum(r.ok for r in results), max(r.inliers for r in results)
-        rows.append({"map": name, "photos": len(others), "accepted": accepted, "inliers": most})
-        print(f"| {name} | {len(others)} | {accepted} | {most} |", flush=True)
+        accepted, most = sum(r.ok for r in results), max(results, key=lambda r: r.inliers)
+        rows.append({"map": name, "photos": len(others), "accepted": accepted,
+                     "inliers": most.inliers, "ratio": most.inlier_ratio})  # fmt: skip
+        print(f"| {name} | {len(others)} | {accepted} | {most.inliers} "
+              f"| {most.inlier_ratio:.2f} |", flush=True)  # fmt: skip
     return rows
 
 
