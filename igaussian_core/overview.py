@@ -228,7 +228,9 @@ def _thin_axes(gmap: GaussianMap, mask: NDArray[np.bool_]) -> Array:
 
 
 def _up_of_scene(gmap: GaussianMap, low: Array, high: Array) -> UpAxis:
-    """Cameras look about level: up is not the axis along which they look."""
+    """Rooms are lower than wide; cameras look about level, so up is not along their view."""
+    if (shortest := int(np.argmin(high - low))) != 0 and _is_hollow(gmap, low, high):
+        return UpAxis(("-y", "z")[shortest - 1], "likely", "a closed room, lower than it is wide")
     centre = np.median(likely_camera_positions(gmap, low, high, samples=1500), axis=0)
     towards = 0.5 * (low + high) - centre
     towards = np.abs(towards) / max(float(np.linalg.norm(towards)), 1e-12)

@@ -104,21 +104,29 @@ def test_info_of_compiled_maps_and_sog_folders(room_igmap: Path, tmp_path: Path)
     assert json.loads(run("map", "info", tmp_path, "--json"))["format"] == ".sog version 2"
 
 
+def turned(gmap: GaussianMap, up: str) -> GaussianMap:
+    """A map with z up, turned."""
+    matrix = {"z": np.eye(3), "-y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+              "y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}[up]  # fmt: skip
+    half = np.sqrt(0.5)
+    w, x = {"z": (1, 0), "-y": (half, half), "y": (half, -half)}[up]
+    q = gmap.quats_wxyz.astype(float)
+    quats = np.c_[w * q[:, 0] - x * q[:, 1], w * q[:, 1] + x * q[:, 0],
+                  w * q[:, 2] - x * q[:, 3], w * q[:, 3] + x * q[:, 2]]  # fmt: skip
+    means = (gmap.means @ np.transpose(matrix)).astype(np.float32)
+    return GaussianMap(means, quats.astype(np.float32), gmap.scales, gmap.opacities, gmap.sh)
+
+
+@pytest.mark.parametrize("turn", ["z", "-y"])
+def test_up_axis_of_a_closed_room(turn: str) -> None:
+    demo = load_map(Path(__file__).parents[2] / "bags" / "demo" / "room.ply")
+    up = likely_up(turned(demo, turn), "scene")
+    assert (up.label, up.confidence) == (turn, "likely")
+
+
 @pytest.mark.parametrize("turn", ["z", "-y", "y"])
 def test_up_axis_of_an_object(turn: str) -> None:
-    gmap = ball()
-    matrix = {"z": np.eye(3), "-y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-              "y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}[turn]  # fmt: skip
-    half = np.sqrt(0.5)
-    quat = {"z": (1, 0, 0, 0), "-y": (half, half, 0, 0), "y": (half, -half, 0, 0)}[turn]
-    w, x = quat[0], quat[1]
-    q = gmap.quats_wxyz.astype(float)
-    turned = np.c_[w * q[:, 0] - x * q[:, 1], w * q[:, 1] + x * q[:, 0],
-                   w * q[:, 2] - x * q[:, 3], w * q[:, 3] + x * q[:, 2]]  # fmt: skip
-    other = GaussianMap(
-        (gmap.means @ np.transpose(matrix)).astype(np.float32), turned.astype(np.float32),
-        gmap.scales, gmap.opacities, gmap.sh,
-    )  # fmt: skip
+    other = turned(ball(), turn)
     up = likely_up(other, "object")
     assert (up.label, up.confidence) == (turn, "likely")
 
