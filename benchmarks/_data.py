@@ -6,6 +6,8 @@ import os
 import sys
 from pathlib import Path
 
+import igaussian_core  # noqa: F401  before torch: says how idle threads wait
+
 
 def data_folder() -> Path:
     """The folder in IGAUSSIAN_DATA, else ../shared/data beside the checkout; exits without."""

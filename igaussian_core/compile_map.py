@@ -101,7 +101,7 @@ def compile_map(
         progress=progress,
     )  # fmt: skip
     background = options.background or ((1.0, 1.0, 1.0) if plan.kind == "object" else (0.0,) * 3)
-    landmarks, matcher = _landmarks(gmap, plan.views, background, config, progress)
+    landmarks, matcher = lift_landmarks(gmap, plan.views, background, config, progress)
     low, high = gmap.bounds()
     manifest = Manifest(
         name=source.stem,
@@ -142,13 +142,18 @@ def training_images(source: Path, cameras: str | Path) -> list[PosedImage]:
     return [image for image in posed if image.name in trained_on] or posed
 
 
-def _landmarks(
+def lift_landmarks(
     gmap: GaussianMap,
     sources: list[SourceView],
     background: tuple[float, ...],
     config: Config,
     progress: Progress,
 ) -> tuple[Landmarks, Matcher]:
+    """Landmarks of the views that show enough, and the matcher they were made with.
+
+    Raises:
+        MapError: no view does.
+    """
     matcher = make_matcher(config.features)
     views = []
     for index, source in enumerate(sources):

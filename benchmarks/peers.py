@@ -1,0 +1,411 @@
+"""The paper's tables and real photos, with other methods on the same queries and machine.
+
+    python benchmarks/peers.py [--quick] [--json benchmarks/results/peers.json] [--work folder]
+
+Tables: the rendered track (layout of the paper's tables 1 and 3), pure rotation (table 2),
+photos, the ablation (table 4), the number of source views (figure 5). Methods are described in
+peer_methods.py; the slow one runs on fewer queries, which the table says. Finished runs are
+kept in --work, so that an interrupted benchmark goes on. Rows that need a stage which is not
+built yet say so. Needs the data folder (_data.py) and pycolmap (extra `bench`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import json
+import math
+import subprocess
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _data import data_folder
+from peer_methods import (
+    CoarseOnly,
+    EssentialMatrix,
+    GradientDescent,
+    Reference,
+    SfmSift,
+    Staged,
+    reference_of_map,
+    reference_of_photo,
+)
+from rich.progress import track
+
+from igaussian_core.compile_map import (
+    CompileOptions,
+    compile_map,
+    lift_landmarks,
+    training_images,
+)
+from igaussian_core.config import Config
+from igaussian_core.evaluate.image_changes import parse_change
+from igaussian_core.evaluate.metrics import (
+    QueryOutcome,
+    by_group,
+    plain,
+    stage_times,
+    summarize,
+)
+from igaussian_core.evaluate.photos import PhotoQueries, extent, held_out_images
+from igaussian_core.evaluate.rendered import (
+    RenderedQueries,
+    camera_of,
+    shows_enough,
+    sphere_of,
+    targets,
+)
+from igaussian_core.evaluate.report import machine_facts
+from igaussian_core.evaluate.runner import Estimator, Partial, Queries, run
+from igaussian_core.geometry import compose, rotation_from_vector
+from igaussian_core.localizer import Localizer
+from igaussian_core.map_package import MapPackage, open_package
+from igaussian_core.posed_images import PosedImage
+from igaussian_core.view_planning import SourceView
+from igaussian_core.views import spherical_views
+
+ROOT = Path(__file__).resolve().parents[1]
+SETS = ("fox", "flower", "fern", "redkitchen", "lego")
+# figure 5: elevations of 4 azimuths each
+VIEW_COUNTS = {
+    8: (-30.0, 30.0), 12: (-45.0, 0.0, 45.0), 16: (-60.0, -30.0, 30.0, 60.0),
+    20: (-60.0, -30.0, 0.0, 30.0, 60.0),
+}  # fmt: skip
+_REFERENCES = 80  # most views that the peers are given
+
+
+class NotBuilt(Exception):
+    """A method that needs a stage which does not exist yet; says which."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """Queries in a map with what every method may use, and what success is."""
+
+    name: str
+    package: MapPackage
+    references: Callable[[], list[Reference]]
+    queries: Queries
+    max_deg: float
+    max_distance: float
+    steps: int  # of gradient descent
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of a table; `slow` ones run on a subset of the queries."""
+
+    name: str
+    open: Callable[[Case], Estimator]
+    slow: bool = False
+
+
+CONFIG = Config()
+SIFT = dataclasses.replace(CONFIG, features=dataclasses.replace(CONFIG.features, matcher="sift"))
+
+
+def _paper(case: Case) -> Estimator:
+    raise NotBuilt("the pose attention network, the essential-matrix solver and the scale ViT")
+
+
+OURS = Method("ours", lambda c: Localizer(c.package, CONFIG))
+PAPER = Method("paper: network + LoFTR + RANSAC + ViT", _paper)
+SFM = Method("SfM, SIFT (pycolmap), PnP", lambda c: SfmSift(c.package, c.references(), CONFIG))
+ESSENTIAL_SIFT = Method(
+    "essential matrix, SIFT", lambda c: EssentialMatrix(c.package, c.references(), SIFT)
+)
+ESSENTIAL_XFEAT = Method(
+    "essential matrix, XFeat", lambda c: EssentialMatrix(c.package, c.references(), CONFIG)
+)
+
+
+def _descent(start: str) -> Callable[[Case], Estimator]:
+    return lambda c: GradientDescent(c.package, CONFIG, start, c.steps)
+
+
+DESCENT_COARSE = Method("gradient descent from our stage one", _descent("coarse"), slow=True)
+DESCENT_PRIOR = Method("gradient descent from the prior", _descent("prior"), slow=True)
+PEERS = (OURS, PAPER, SFM, ESSENTIAL_SIFT, ESSENTIAL_XFEAT, DESCENT_COARSE, DESCENT_PRIOR)
+
+
+def _staged(refine: Callable[..., Any], **settings: Any) -> Callable[[Case], Estimator]:
+    config = Config.from_flat({f"refine.{k}": v for k, v in settings.items()})
+    return lambda c: Staged(c.package, config, refine)
+
+
+ABLATION = (
+    Method("paper: pose attention network alone", _paper),
+    Method("paper: network + WPM", _paper),
+    Method("paper: network + WPM + ViT", _paper),
+    Method("paper: network + WPM + LoFTR and RANSAC", _paper),
+    Method("paper: all", _paper),
+    Method("ours: landmarks alone (stage one)", lambda c: CoarseOnly(c.package, CONFIG)),
+    Method("ours: + matching and PnP, one round",
+           _staged(lambda r, q, T: r.match(q, T), rounds=1)),
+    Method("ours: + matching and PnP, two rounds", _staged(lambda r, q, T: r.match(q, T))),
+    Method("ours: landmarks + alignment, no matching", _staged(lambda r, q, T: r.align(q, T))),
+    Method("ours: all, alignment in one round",
+           _staged(lambda r, q, T: r.refine(q, T), align_rounds=1)),
+    OURS,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How much is run."""
+
+    each: int  # targets a bin
+    slow_each: int  # of them for the slow method
+    photos: int  # most photos a set
+    slow_photos: int
+    steps: int = 200  # of gradient descent
+
+
+FULL, QUICK = Scale(30, 2, 30, 3), Scale(2, 1, 2, 1, steps=20)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, help="where to write all figures")
+    parser.add_argument("--work", type=Path, default=ROOT / "out" / "peers")
+    parser.add_argument("--quick", action="store_true", help="few queries: does it run?")
+    parser.add_argument("--only", help="one table: rendered, rotation, photos, ablation, views")
+    options = parser.parse_args()
+    scale = QUICK if options.quick else FULL
+    work = options.work / ("quick" if options.quick else "full")
+    work.mkdir(parents=True, exist_ok=True)
+    tables = {
+        "rendered": _rendered_table, "rotation": _rotation_table, "photos": _photo_table,
+        "ablation": _ablation_table, "views": _views_table,
+    }  # fmt: skip
+    report: dict[str, Any] = {"facts": {**machine_facts(), "commit": _commit()}}
+    report["facts"]["run"] = "quick" if options.quick else "full"
+    for name, make in tables.items():
+        if options.only in (None, name):
+            report[name] = make(work, scale)
+            print_table(name, report[name])
+    if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.write_text(json.dumps(report, indent=1) + "\n")
+
+
+def _commit() -> str:
+    run_ = subprocess.run(
+        ["git", "-C", str(ROOT), "describe", "--always", "--dirty"], capture_output=True, text=True
+    )
+    return run_.stdout.strip() or "unknown"
+
+
+# --- tables ---
+
+
+def _rendered_table(work: Path, scale: Scale) -> list[dict[str, Any]]:
+    cases = [
+        _rendered_case("lego", _lego(work), scale, source_prior=True),
+        _rendered_case("demo room", _room(work), scale, source_prior=True),
+    ]
+    return [row for case in cases for row in _rows(case, PEERS, work, "rendered", scale)]
+
+
+def _rotation_table(work: Path, scale: Scale) -> list[dict[str, Any]]:
+    case = _rendered_case("demo room", _room(work), scale, True, pure_rotation=True)
+    return _rows(case, PEERS, work, "rotation", scale)
+
+
+def _photo_table(work: Path, scale: Scale) -> list[dict[str, Any]]:
+    rows = []
+    for name in SETS:
+        rows += _rows(_photo_case(name, work, scale), PEERS, work, "photos", scale)
+    return rows
+
+
+def _ablation_table(work: Path, scale: Scale) -> list[dict[str, Any]]:
+    """As table 4: pairs 20 to 40 degrees away, rendered; and the photos of a kitchen."""
+    case = _rendered_case("demo room", _room(work), scale)
+    kitchen = _photo_case("redkitchen", work, scale)
+    near = dataclasses.replace(
+        case.queries, targets=tuple(t for t in case.queries.targets if t.bin == "20-40")
+    )
+    near_case = dataclasses.replace(case, queries=near)
+    return [
+        *_rows(near_case, ABLATION, work, "ablation", scale),
+        *_rows(kitchen, ABLATION, work, "ablation", scale),
+    ]
+
+
+def _views_table(work: Path, scale: Scale) -> list[dict[str, Any]]:
+    """As figure 5: only so many spherical source views, no training camera is known."""
+    whole, rows = _lego(work), []
+    for count, elevations in VIEW_COUNTS.items():
+        package = _with_views(whole, elevations)
+        rendered = _rendered_case(f"lego, {count} views", package, scale)
+        photos = _photo_case("lego", work, scale)
+        case = dataclasses.replace(photos, name=f"lego photos, {count} views", package=package)
+        for part in (rendered, case):
+            rows += [
+                {**row, "views": count} for row in _rows(part, (OURS,), work, "views", scale)
+            ]
+    return rows
+
+
+def _rows(
+    case: Case, methods: Sequence[Method], work: Path, table: str, scale: Scale
+) -> list[dict[str, Any]]:
+    rows = []
+    for method in track(methods, description=f"{table}: {case.name}"):
+        row: dict[str, Any] = {"case": case.name, "method": method.name}
+        try:
+            outcomes = _outcomes(case, method, work, table, scale)
+        except NotBuilt as error:
+            rows.append({**row, "not_built": str(error)})
+            continue
+        limits = (case.max_deg, case.max_distance)
+        row["summary"] = plain(summarize(outcomes, *limits))
+        groups = by_group(outcomes)
+        if len(groups) > 1:
+            row["groups"] = {k: plain(summarize(v, *limits)) for k, v in groups.items()}
+        row["stage_ms"] = {k: round(v["median_ms"], 1) for k, v in stage_times(outcomes).items()}
+        if method.slow:
+            row["iterations"] = case.steps
+        rows.append(row)
+    return rows
+
+
+def _outcomes(
+    case: Case, method: Method, work: Path, table: str, scale: Scale
+) -> list[QueryOutcome]:
+    queries = _subset(case.queries, scale) if method.slow else case.queries
+    name = "".join(c if c.isalnum() else "_" for c in f"{table}-{case.name}-{method.name}")
+    names = [queries.name(i) for i in range(len(queries))]
+    key = json.dumps([names, case.steps, case.package.manifest.gaussians_sha256, CONFIG.to_flat()])
+    partial = Partial(work / f"{name}.jsonl", key)
+    return run(lambda: method.open(case), queries, partial).outcomes
+
+
+def _subset(queries: Any, scale: Scale) -> Queries:
+    """The first targets of each bin, or photos spread over the set."""
+    if isinstance(queries, RenderedQueries):
+        kept = [t for t in queries.targets if int(t.name.split("/")[1]) < scale.slow_each]
+        return dataclasses.replace(queries, targets=tuple(kept))
+    return dataclasses.replace(queries, images=_spread(queries.images, scale.slow_photos))
+
+
+def _spread(images: Sequence[PosedImage], count: int) -> tuple[PosedImage, ...]:
+    index = np.unique(np.linspace(0, len(images) - 1, min(count, len(images))).round().astype(int))
+    return tuple(images[i] for i in index)
+
+
+# --- cases ---
+
+
+def _rendered_case(
+    name: str,
+    package: MapPackage,
+    scale: Scale,
+    source_prior: bool = False,
+    pure_rotation: bool = False,
+) -> Case:
+    sphere, camera = sphere_of(package), camera_of(package)
+    usable = [shows_enough(package.gaussians, camera)] if sphere.kind == "scene" else []
+    drawn = targets(sphere, scale.each, 0.0 if pure_rotation else 0.2, 0, *usable)
+    red, green, blue = package.manifest.background
+    queries = RenderedQueries(
+        tuple(drawn), package.gaussians, camera, (red, green, blue), package.T_map_scene,
+        (parse_change("paper"),), source_prior,
+    )  # fmt: skip
+
+    def references() -> list[Reference]:
+        count = package.landmarks.view_count
+        chosen = np.unique(np.linspace(0, count - 1, min(count, _REFERENCES)).astype(int))
+        return [reference_of_map(package, int(view), CONFIG) for view in chosen]
+
+    limit = math.inf if pure_rotation else 0.05
+    return Case(name, package, functools.cache(references), queries, 5.0, limit, scale.steps)
+
+
+@dataclass(frozen=True)
+class PriorPhotos(PhotoQueries):
+    """Photos with a perturbed pose as prior: 10 degrees and 5 % of the extent off."""
+
+    offset: float = 0.0
+
+    def prior(self, index: int) -> np.ndarray:
+        rng = np.random.default_rng(index)
+        turn, move = rng.normal(size=3), rng.normal(size=3)
+        turn *= np.radians(10) / np.linalg.norm(turn)
+        move *= self.offset / np.linalg.norm(move)
+        T = self.truth(index)
+        return compose(rotation_from_vector(turn) @ T[:3, :3], T[:3, 3] + move)
+
+
+def _photo_case(name: str, work: Path, scale: Scale) -> Case:
+    folder = data_folder() / "sets" / name
+    package = _compiled(work, name, folder / "map.ply", folder / "poses.json")
+    training = training_images(folder / "map.ply", folder / "poses.json")
+    held_out = held_out_images(folder / "poses.json", None)
+    if name == "lego":
+        held_out = [image for image in held_out if image.name.startswith("test")]
+    red, green, blue = package.manifest.background
+    size = extent(training)
+    queries = PriorPhotos(
+        _spread(held_out, scale.photos), package.T_map_scene, (red, green, blue),
+        offset=0.05 * size,
+    )  # fmt: skip
+
+    def references() -> list[Reference]:
+        ground = tuple(round(255 * value) for value in (red, green, blue))
+        return [
+            reference_of_photo(package, i.read(ground), i.camera, i.T_scene_cam, CONFIG)  # type: ignore[arg-type]
+            for i in _spread(training, _REFERENCES)
+        ]
+
+    return Case(name, package, functools.cache(references), queries, 5.0, 0.05 * size, scale.steps)
+
+
+def _lego(work: Path) -> MapPackage:
+    folder = data_folder() / "sets" / "lego"
+    return _compiled(work, "lego", folder / "map.ply", folder / "poses.json")
+
+
+def _room(work: Path) -> MapPackage:
+    demo = ROOT / "bags" / "demo"
+    return _compiled(work, "room", demo / "room.ply", demo / "mapping_cameras.json")
+
+
+def _compiled(work: Path, name: str, source: Path, cameras: Path) -> MapPackage:
+    target = work.parent / f"{name}.igmap"
+    if not target.is_dir():
+        compile_map(source, target, cameras, CompileOptions())
+    return open_package(target)
+
+
+def _with_views(package: MapPackage, elevations_deg: tuple[float, ...]) -> MapPackage:
+    """The map with landmarks of spherical views only."""
+    sphere, camera = sphere_of(package), camera_of(package)
+    poses = spherical_views(
+        sphere.kind, sphere.radius, sphere.centre, sphere.up, elevations_deg=elevations_deg
+    )
+    sources = [SourceView(camera, T) for T in poses]
+    landmarks, _ = lift_landmarks(
+        package.gaussians, sources, tuple(package.manifest.background), CONFIG,
+        lambda stage, done, of: None,
+    )  # fmt: skip
+    return dataclasses.replace(package, landmarks=landmarks)
+
+
+# --- printing ---
+
+
+def print_table(name: str, rows: Sequence[dict[str, Any]]) -> None:
+    """One table as Markdown, on stdout."""
+    from tables import peers_markdown
+
+    print(f"\n### {name}\n\n{peers_markdown(name, rows)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
