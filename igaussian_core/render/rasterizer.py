@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import weakref
 from collections.abc import Collection
@@ -30,6 +31,7 @@ OUTPUTS = ("rgb", "depth", "alpha", "median_depth", "ids")
 # 3DGS cuts at 0.2 of a unit, which is 20 cm in a metric map: a robot stands closer to things
 DEFAULT_NEAR = 0.01
 MAX_SIDE = 1 << 15
+_CACHE_LINE = 64
 
 
 class Render(NamedTuple):
@@ -342,11 +344,17 @@ def check_camera(camera: Camera) -> None:
 
 def _rigid(T: ArrayLike) -> NDArray[np.float64]:
     matrix = np.ascontiguousarray(T, np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise CameraError(f"renderer: T_cam_scene must be a finite 4x4 matrix, got\n{matrix}")
+    if matrix.shape != (4, 4):
+        raise CameraError(f"renderer: T_cam_scene has shape {matrix.shape}, expected (4, 4)")
+    if not np.isfinite(matrix).all():
+        raise CameraError("renderer: T_cam_scene has values that are not finite")
     R = matrix[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-        raise CameraError(f"renderer: T_cam_scene is not a rigid transform:\n{matrix}")
+    skew = float(np.abs(R @ R.T - np.eye(3)).max())
+    if skew > 1e-3 or np.linalg.det(R) < 0:
+        raise CameraError(
+            f"renderer: T_cam_scene is not a rigid transform: R R^T differs from the identity by "
+            f"{skew:.2g}, det R is {np.linalg.det(R):.3g}"
+        )
     return matrix
 
 
@@ -359,13 +367,20 @@ def _allocate(
             f"renderer: unknown outputs {sorted(unknown)}; supported: {', '.join(OUTPUTS)}"
         )
     size = (*views, camera.height, camera.width)
-    images: dict[str, NDArray[Any]] = {}
-    for name in outputs:
-        if name == "ids":
-            images[name] = np.empty(size, np.int32)
-        else:
-            images[name] = np.empty((*size, 3) if name == "rgb" else size, np.float32)
-    return images
+    return {
+        name: _empty(
+            (*size, 3) if name == "rgb" else size, np.int32 if name == "ids" else np.float32
+        )
+        for name in outputs
+    }
+
+
+def _empty(shape: tuple[int, ...], dtype: type[np.generic]) -> NDArray[Any]:
+    """An array of 4-byte items that starts at a cache line, as the kernel writes large images."""
+    size = 4 * math.prod(shape)
+    memory = np.empty(size + _CACHE_LINE, np.uint8)
+    start = -memory.ctypes.data % _CACHE_LINE
+    return memory[start : start + size].view(dtype).reshape(shape)
 
 
 def _as_render(images: dict[str, NDArray[Any]]) -> Render:

@@ -165,7 +165,7 @@ inline void project_lanes(const Model& model, const View& view, const Bins& bins
                    dy * inv_distance, dz * inv_distance, rgb);
 
   const F inv_cyy = splat(1.0f) / cyy;
-  const F half_log2e = splat(0.5f * 1.4426950408889634f);
+  const F half_log2e = splat(0.5f * 1.4426950408889634f * kLogUnit);
   const F inv_along = root(det * inv_cyy / half_log2e), along = splat(1.0f) / inv_along;
   const F slope = sxy * inv_cyy;
   const F fields[16] = {u,
@@ -173,7 +173,7 @@ inline void project_lanes(const Model& model, const View& view, const Bins& bins
                         along,
                         -along * slope,
                         root(half_log2e * inv_cyy),
-                        lo,
+                        (lo - splat(kLog2AlphaMin)) * splat(kLogUnit),
                         rgb[0],
                         rgb[1],
                         rgb[2],
@@ -241,7 +241,7 @@ inline void cells_touched(Batch* batch, int i, float tile_u, float tile_v) {
   F fields[7];
   from_lines(&batch->splats[i].u, kFields, fields);
   const F u = fields[0] - splat(tile_u), v = fields[1] - splat(tile_v);
-  const F curve = fields[2] * fields[2], reach = fields[3] - splat(kLog2AlphaMin);
+  const F curve = fields[2] * fields[2], reach = fields[3];
   const F slope = fields[4], dy_right = fields[5], inv_along = fields[6];
   // rounding may add a cell, never lose a pixel
   const F slack = splat(0.01f), widened = inv_along * splat(1.0005f);
@@ -309,12 +309,15 @@ const Offsets kPixelOffsets = {{0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3},
 // W pixels while Gaussians are blended into them.
 template <bool kExtra>
 struct Accumulator {
-  F x, y;  // pixel centres
-  F t, alpha, red, green, blue, depth;
+  F x, y;      // pixel centres
+  M open;      // pixels that are not finished
+  F t, alpha;  // of open pixels the transmittance, of finished ones alpha
+  F red, green, blue, depth;
   F median, heaviest, id;
 
   inline void read(const float* p) {
     t = load(p + kT * kPixels);
+    open = at_least(t, splat(kStop));
     alpha = load(p + kAlpha * kPixels);
     red = load(p + kRed * kPixels);
     green = load(p + kGreen * kPixels);
@@ -328,7 +331,7 @@ struct Accumulator {
 
   inline void write(float* p) const {
     store(p + kT * kPixels, t);
-    store(p + kAlpha * kPixels, alpha);
+    store(p + kAlpha * kPixels, pick(open, splat(1.0f) - t, alpha));
     store(p + kRed * kPixels, red);
     store(p + kGreen * kPixels, green);
     store(p + kBlue * kPixels, blue);
@@ -343,48 +346,59 @@ struct Accumulator {
   inline void alphas(const Splat* splats, const uint32_t* list, F* a) const {
     const Splat* s[kAbreast];
     F dx[kAbreast], dy[kAbreast], p[kAbreast], q[kAbreast];
-    M counts[kAbreast];
     for (int i = 0; i < kAbreast; ++i) s[i] = splats + list[i];
     for (int i = 0; i < kAbreast; ++i) dx[i] = x - splat(s[i]->u);
     for (int i = 0; i < kAbreast; ++i) dy[i] = y - splat(s[i]->v);
     for (int i = 0; i < kAbreast; ++i) q[i] = splat(s[i]->across) * dy[i];
     for (int i = 0; i < kAbreast; ++i) p[i] = splat(s[i]->shear) * dy[i];
     for (int i = 0; i < kAbreast; ++i) p[i] = splat(s[i]->along) * dx[i] + p[i];
-    for (int i = 0; i < kAbreast; ++i) {
-      a[i] = minus_product(splat(s[i]->log_opacity), q[i], q[i]);
-    }
+    for (int i = 0; i < kAbreast; ++i) a[i] = minus_product(splat(s[i]->reach), q[i], q[i]);
     for (int i = 0; i < kAbreast; ++i) a[i] = minus_product(a[i], p[i], p[i]);
-    for (int i = 0; i < kAbreast; ++i) counts[i] = at_least(a[i], splat(kLog2AlphaMin));
-    exp2_near<kAbreast>(a);
-    for (int i = 0; i < kAbreast; ++i) a[i] = keep(counts[i], smaller(a[i], splat(kAlphaMax)));
+    alphas_near<kAbreast>(a);
+    for (int i = 0; i < kAbreast; ++i) a[i] = smaller_positive(a[i], splat(kAlphaMax));
   }
 
   // kTogether Gaussians, front to back
   inline void add(const Splat* splats, const uint32_t* list) {
-    F a[kTogether], weight[kTogether];
+    F a[kTogether], weight[kTogether], left[kTogether];
     for (int i = 0; i < kTogether; i += kAbreast) alphas(splats, list + i, a + i);
+    const F before = t;
     for (int i = 0; i < kTogether; ++i) {
-      const F before = t;
-      t = minus_product(before, a[i], before);
-      // the Gaussian that would push the transmittance under kStop is dropped, and so is all
-      // behind it, as t never grows again
-      weight[i] = keep(at_least(t, splat(kStop)), a[i] * before);
+      weight[i] = a[i] * t;
+      left[i] = t = minus_product(t, a[i], t);
+    }
+    if (__builtin_expect(bits(without(open, at_least(t, splat(kStop)))), 0)) {
+      finish_some(before, a, weight, left);
     }
     for (int i = 0; i < kTogether; ++i) {
       const Splat& s = splats[list[i]];
-      alpha = alpha + weight[i];
       red = red + weight[i] * splat(s.red);
       green = green + weight[i] * splat(s.green);
       blue = blue + weight[i] * splat(s.blue);
       depth = depth + weight[i] * splat(s.z);
-      if (kExtra) add_extra(s, weight[i]);
+      if (kExtra) add_extra(s, weight[i], i ? left[i - 1] : before, left[i]);
     }
   }
 
-  inline void add_extra(const Splat& s, F weight) {
+  // Blends again where a pixel finishes: the Gaussian that would push its transmittance under
+  // kStop is dropped, and so is all behind it.
+  inline void finish_some(F before, const F* a, F* weight, F* left) {
+    t = before;
+    M still = open;
+    for (int i = 0; i < kTogether; ++i) {
+      const F w = a[i] * t, next = minus_product(t, a[i], t);
+      still = both(still, at_least(next, splat(kStop)));
+      weight[i] = keep(still, w);
+      left[i] = t = pick(still, next, t);
+    }
+    alpha = pick(without(open, still), splat(1.0f) - t, alpha);
+    t = keep(still, t);
+    open = still;
+  }
+
+  inline void add_extra(const Splat& s, F weight, F before, F after) {
     const F half = splat(0.5f);
-    const M crossed = both(at_least(alpha, half), above(half, alpha - weight));
-    median = pick(crossed, splat(s.z), median);
+    median = pick(both(above(before, half), at_least(half, after)), splat(s.z), median);
     const M heavier = above(weight, heaviest);
     heaviest = pick(heavier, weight, heaviest);
     float index;
@@ -402,13 +416,11 @@ inline bool blend_cell(const Batch& batch, int size, float cell_u, float cell_v,
     sum.x = splat(cell_u) + load(kPixelOffsets.x + l);
     sum.y = splat(cell_v) + load(kPixelOffsets.y + l);
     sum.read(pixels + l);
-    unsigned open = bits(at_least(sum.t, splat(kStop)));
-    for (int i = 0; i < size && open; i += kTogether) {
+    for (int i = 0; i < size && bits(sum.open); i += kTogether) {
       sum.add(batch.splats, batch.list + i);
-      open = bits(at_least(sum.t, splat(kStop)));
     }
     sum.write(pixels + l);
-    unfinished |= open;
+    unfinished |= bits(sum.open);
   }
   return unfinished != 0;
 }
@@ -499,21 +511,32 @@ inline void finish_cell(float* cell, const Images& images) {
   }
 }
 
-// Pixels [0, count) of one row of a cell.
-inline void write_row(const float* cell, size_t at, int count, const Images& images) {
-  if (images.rgb) {
-    float* rgb = images.rgb + at * 3;
-    const float* red = cell + kRed * kPixels;
-    float mixed[3 * kCell];
-    for (int x = 0; x < kCell; ++x) {
-      for (int k = 0; k < 3; ++k) mixed[3 * x + k] = red[k * kPixels + x];
+// Pixels [0, count) of one row of a cell, at the image's edge.
+void write_some(const float* cell, size_t at, int count, const Images& images) {
+  for (int x = 0; x < count; ++x) {
+    for (int k = 0; k < 3 && images.rgb; ++k) {
+      images.rgb[(at + x) * 3 + k] = cell[(kRed + k) * kPixels + x];
     }
-    std::memcpy(rgb, mixed, count * 3 * sizeof(float));
+    if (images.depth) images.depth[at + x] = cell[kDepth * kPixels + x];
+    if (images.alpha) images.alpha[at + x] = cell[kAlpha * kPixels + x];
+    if (images.median_depth) images.median_depth[at + x] = cell[kMedian * kPixels + x];
+    if (images.ids) std::memcpy(images.ids + at + x, cell + kId * kPixels + x, sizeof(float));
+  }
+}
+
+// A whole row of a cell.
+template <bool kPastCache>
+inline void write_row(const float* cell, size_t at, const Images& images) {
+  if (images.rgb) {
+    const F4 r = load4(cell + kRed * kPixels), g = load4(cell + kGreen * kPixels),
+             b = load4(cell + kBlue * kPixels);
+    float* rgb = images.rgb + at * 3;
+    store4<kPastCache>(rgb, F4{r[0], g[0], b[0], r[1]});
+    store4<kPastCache>(rgb + 4, F4{g[1], b[1], r[2], g[2]});
+    store4<kPastCache>(rgb + 8, F4{b[2], r[3], g[3], b[3]});
   }
   const auto copy = [&](void* image, int plane) {
-    if (image) {
-      std::memcpy(static_cast<float*>(image) + at, cell + plane * kPixels, count * sizeof(float));
-    }
+    if (image) store4<kPastCache>(static_cast<float*>(image) + at, load4(cell + plane * kPixels));
   };
   copy(images.depth, kDepth);
   copy(images.alpha, kAlpha);
@@ -521,23 +544,43 @@ inline void write_row(const float* cell, size_t at, int count, const Images& ima
   copy(images.ids, kId);
 }
 
+template <bool kPastCache>
+void write_rows(const View& view, const TileBuffer& buffer, int x0, int y0, const Images& images) {
+  const int width = view.width - x0 < kTile ? view.width - x0 : kTile;
+  const int height = view.height - y0 < kTile ? view.height - y0 : kTile;
+  for (int y = 0; y < height; ++y) {
+    const size_t row = static_cast<size_t>(y0 + y) * view.width + x0;
+    const float* cell = buffer.cell[y / kCell * 8][0] + y % kCell * kCell;
+    int x = 0;
+    for (; x + kCell <= width; x += kCell, cell += kPlanes * kPixels) {
+      write_row<kPastCache>(cell, row + x, images);
+    }
+    if (x < width) write_some(cell, row + x, width - x, images);
+  }
+}
+
+// Large images are written past the cache: a row of a tile is a few cache lines, and waiting for
+// each to be read first took a tenth of the frame. This pays only where whole lines are written.
+inline bool writes_past_cache(const View& view, const Images& images) {
+  constexpr int kLine = 64, kLargePixels = 1 << 17;
+  const uintptr_t addresses = reinterpret_cast<uintptr_t>(images.rgb) |
+                              reinterpret_cast<uintptr_t>(images.depth) |
+                              reinterpret_cast<uintptr_t>(images.alpha) |
+                              reinterpret_cast<uintptr_t>(images.median_depth) |
+                              reinterpret_cast<uintptr_t>(images.ids);
+  return view.width * view.height >= kLargePixels && addresses % kLine == 0 &&
+         view.width * sizeof(float) % kLine == 0;
+}
+
 void write_pixels(const View& view, TileBuffer* buffer, int x0, int y0, uint64_t inside,
                   const Images& images) {
   for (uint64_t m = inside; m; m &= m - 1) {
     finish_cell(buffer->cell[__builtin_ctzll(m)][0], images);
   }
-  const int width = view.width - x0 < kTile ? view.width - x0 : kTile;
-  const int height = view.height - y0 < kTile ? view.height - y0 : kTile;
-  for (int y = 0; y < height; ++y) {
-    const size_t row = static_cast<size_t>(y0 + y) * view.width + x0;
-    for (int x = 0; x < width; x += kCell) {
-      const float* cell = buffer->cell[y / kCell * 8 + x / kCell][0] + y % kCell * kCell;
-      if (width - x >= kCell) {
-        write_row(cell, row + x, kCell, images);
-      } else {
-        write_row(cell, row + x, width - x, images);
-      }
-    }
+  if (writes_past_cache(view, images)) {
+    write_rows<true>(view, *buffer, x0, y0, images);
+  } else {
+    write_rows<false>(view, *buffer, x0, y0, images);
   }
 }
 
@@ -546,7 +589,7 @@ int64_t blend(const View& view, const Splat* splats, const uint64_t* keys, int64
   TileBuffer buffer;
   Batch batch;
   batch.splats[kBatch] = Splat{};
-  batch.splats[kBatch].log_opacity = -100.0f;
+  batch.splats[kBatch].reach = -1.0f;
   const int x0 = tile_x * kTile, y0 = tile_y * kTile;
   const bool extra = images.median_depth || images.ids;
   clear(&buffer, extra);
@@ -619,11 +662,10 @@ void start_backward(const View& view, int x0, int y0, uint64_t inside, const Ima
 inline void backward_lanes(const Splat& s, F x, F y, float* pixels, float* sums) {
   const F dx = x - splat(s.u), dy = y - splat(s.v);
   const F p = splat(s.along) * dx + splat(s.shear) * dy, q = splat(s.across) * dy;
-  F a = splat(s.log_opacity) - p * p - q * q;
-  const M counts = at_least(a, splat(kLog2AlphaMin));
-  exp2_near<1>(&a);
+  F a = splat(s.reach) - p * p - q * q;
+  alphas_near<1>(&a);
   const M free = at_least(splat(kAlphaMax), a);
-  a = keep(counts, smaller(a, splat(kAlphaMax)));
+  a = smaller_positive(a, splat(kAlphaMax));
   const auto plane = [&](int k) { return load(pixels + k * kPixels); };
   const F before = plane(kBackT), after = minus_product(before, a, before);
   store(pixels + kBackT * kPixels, after);
@@ -635,7 +677,7 @@ inline void backward_lanes(const Splat& s, F x, F y, float* pixels, float* sums)
   const F rest = plane(kRest) - weight * by_weight;
   store(pixels + kRest * kPixels, rest);
   const F by_alpha = before * by_weight - rest / (splat(1.0f) - a);
-  const F by_power = keep(both(alive, both(counts, free)), a * by_alpha);
+  const F by_power = keep(both(alive, free), a * by_alpha);
   const F by_p = by_power * p, by_q = by_power * q;
   const F terms[kSums] = {by_p,
                           by_q,
@@ -672,12 +714,12 @@ SplatGradient gather_sums(const Splat& s, const float (*sums)[W]) {
     for (int l = 0; l < W; ++l) total[k] += sums[k][l];
   }
   constexpr float kLn2 = 0.6931471805599453f;  // of alpha = 2^power
-  const float by_p = kLn2 * total[0], by_q = kLn2 * total[1];
-  return {2 * s.along * by_p,
-          2 * (s.shear * by_p + s.across * by_q),
-          -2 * kLn2 * total[2],
-          -2 * kLn2 * total[3],
-          -2 * kLn2 * total[4],
+  constexpr float kUnit = 2 * kLn2 / kLogUnit, kRoot = -2 * kLn2 / kLogUnitRoot;
+  return {s.along * total[0] * kUnit,
+          (s.shear * total[0] + s.across * total[1]) * kUnit,
+          total[2] * kRoot,
+          total[3] * kRoot,
+          total[4] * kRoot,
           kLn2 * total[5],
           {total[6], total[7], total[8]},
           total[9]};
@@ -690,7 +732,7 @@ void blend_backward(const View& view, const Splat* splats, const uint64_t* keys,
   Batch batch;
   Sums sums;
   batch.splats[kBatch] = Splat{};
-  batch.splats[kBatch].log_opacity = -100.0f;
+  batch.splats[kBatch].reach = -1.0f;
   const int x0 = tile_x * kTile, y0 = tile_y * kTile;
   const float u = static_cast<float>(x0), v = static_cast<float>(y0);
   clear(&buffer, false);

@@ -326,6 +326,7 @@ void Renderer::blend(int thread, const View& view, const Images& images) {
     worker.nanoseconds[2] +=
         std::chrono::duration_cast<std::chrono::nanoseconds>(start - sorted).count();
   }
+  std::atomic_thread_fence(std::memory_order_seq_cst);  // for pixels written past the cache
 }
 
 // job(thread) on each thread, with next_ counting from 0.

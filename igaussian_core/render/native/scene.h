@@ -35,6 +35,9 @@ constexpr int kCells = 64;        // cells in a tile: one bit each of a 64-bit m
 constexpr int kPixels = 16;       // pixels in a cell
 
 constexpr float kLog2AlphaMin = -7.994353436858858f;  // log2(1/255)
+// Logarithms of alpha are kept times 2^23: as integers they are then the bits of a float whose
+// exponent is right (alphas_near)
+constexpr float kLogUnit = 8388608.0f, kLogUnitRoot = 2896.309376f;
 constexpr float kAlphaMax = 0.99f;
 constexpr float kStop = 1e-4f;     // a pixel is finished when its transmittance falls below
 constexpr float kLowPass = 0.3f;   // pixels^2 added to each projected covariance
@@ -71,10 +74,11 @@ struct View {
 };
 
 // A projected Gaussian, one cache line. At (dx, dy) pixels from (u, v)
-//   log2(alpha) = log_opacity - (along * dx + shear * dy)^2 - (across * dy)^2,
-// the Cholesky form of the inverse covariance: a sum of squares, which does not cancel.
+//   log2(255 * alpha) * 2^23 = reach - (along * dx + shear * dy)^2 - (across * dy)^2,
+// the Cholesky form of the inverse covariance: a sum of squares, which does not cancel. Negative
+// where alpha is below 1/255.
 struct alignas(64) Splat {
-  float u, v, along, shear, across, log_opacity;
+  float u, v, along, shear, across, reach;
   float red, green, blue, z;
   // the ellipse alpha = 1/255, at height dy over (u, v), is centred on slope * dy and reaches
   // farthest right at dy_right; inv_along = 1 / along
@@ -84,7 +88,8 @@ struct alignas(64) Splat {
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
 
-// Gradient of the loss by a Splat's members.
+// Gradient of the loss by a Splat's members, those in units of 2^23 taken without them:
+// along, shear and across divided by 2^11.5, log_opacity = log2(opacity).
 struct SplatGradient {
   float u, v, along, shear, across, log_opacity;
   float rgb[3], z;

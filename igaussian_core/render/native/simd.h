@@ -58,6 +58,23 @@ inline I byte_of(I words, int number) {
 }
 inline M any_bit(I x) { return _mm512_test_epi32_mask(x, x); }
 inline M has_bit(I x, int bit) { return _mm512_test_epi32_mask(x, _mm512_set1_epi32(1u << bit)); }
+// 1 to 2 with the mantissa bits of x
+inline F mantissa_of(I x) {
+  const I one = _mm512_set1_epi32(0x3f800000), bits = _mm512_set1_epi32(0x007fffff);
+  return _mm512_castsi512_ps(_mm512_ternarylogic_epi32(x, bits, one, 0xea));
+}
+// x * 2^(exponent bits of by), 0 where by is negative. Integer operations: comparisons into mask
+// registers would wait for the multipliers.
+inline F raised(F x, I by) {
+  const I exponent = _mm512_and_si512(by, _mm512_set1_epi32(~0x007fffff));
+  const I product = _mm512_add_epi32(_mm512_castps_si512(x), exponent);
+  return _mm512_castsi512_ps(_mm512_andnot_si512(_mm512_srai_epi32(by, 31), product));
+}
+// smaller(a, b) for a, b >= 0, on any port
+inline F smaller_positive(F a, F b) {
+  return _mm512_castsi512_ps(_mm512_min_epi32(_mm512_castps_si512(a), _mm512_castps_si512(b)));
+}
+inline M without(M a, M b) { return a & static_cast<M>(~b); }
 inline I counting_from(int first) {
   const I iota = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
   return _mm512_add_epi32(iota, _mm512_set1_epi32(first));
@@ -190,6 +207,10 @@ inline I load_int(const uint32_t* p) { return *reinterpret_cast<const I*>(p); }
 inline I byte_of(I words, int number) { return (words >> (8 * number)) & 255; }
 inline M any_bit(I x) { return (M)(x != 0); }
 inline M has_bit(I x, int bit) { return x << (31 - bit); }  // only the sign counts
+inline F mantissa_of(I x) { return (F)((x & 0x007fffff) | 0x3f800000); }
+inline F raised(F x, I by) { return (F)(~(by >> 31) & ((I)x + (by & ~0x007fffff))); }
+inline F smaller_positive(F a, F b) { return smaller(a, b); }
+inline M without(M a, M b) { return a & ~b; }
 inline I counting_from(int first) {
   I x;
   for (int l = 0; l < W; ++l) x[l] = first + l;
@@ -244,31 +265,35 @@ inline void from_lines(const float* lines, const int (&fields)[kCount], F* rows)
 
 #endif
 
-// q[i] = 2^q[i] for q in [-126, 126], relative error 7.5e-5; garbage outside, NaN for NaN.
-// Coefficients: minimax of the relative error, degree 3. The loops go over independent values
-// because each step waits for the one before.
+// Four floats at a 16-byte aligned place, of any instruction set.
+using F4 = float __attribute__((vector_size(16)));
+inline F4 load4(const float* p) {
+  F4 x;
+  __builtin_memcpy(&x, p, sizeof(x));
+  return x;
+}
+template <bool kPastCache>
+inline void store4(float* p, F4 x) {
+#if defined(__SSE2__)
+  if (kPastCache) return _mm_stream_ps(p, x);
+#endif
+  __builtin_memcpy(p, &x, sizeof(x));
+}
+
+// q[i] = 2^(q[i] / 2^23) / 255 for 0 <= q[i] < 2^27, relative error 7.5e-5; 0 for negative ones.
+// Rounded to an integer, q has the exponent of the result in its upper bits and a mantissa m in
+// [1, 2) below, of which 2^(m - 1) / 255 is a cubic (minimax of the relative error). The loops go
+// over independent values because each step waits for the one before.
 template <int N>
-inline void exp2_near(F* q) {
-  F r[N], p[N];
-#if defined(__AVX512F__)
-  for (int i = 0; i < N; ++i) r[i] = _mm512_reduce_ps(q[i], 0x09);  // q - floor(q)
-  constexpr float c[4] = {9.99925220e-1f, 6.95833540e-1f, 2.26067160e-1f, 7.80245200e-2f};
-#else
-  // adding 1.5 * 2^23 rounds to an integer that is left in the low bits
-  const F magic = splat(12582912.0f);
-  F shifted[N];
-  for (int i = 0; i < N; ++i) shifted[i] = q[i] + magic;
-  for (int i = 0; i < N; ++i) r[i] = q[i] - (shifted[i] - magic);
-  constexpr float c[4] = {9.99928070e-1f, 6.93260990e-1f, 2.42611110e-1f, 5.51716700e-2f};
-#endif
-  for (int i = 0; i < N; ++i) p[i] = r[i] * splat(c[3]) + splat(c[2]);
-  for (int i = 0; i < N; ++i) p[i] = p[i] * r[i] + splat(c[1]);
-  for (int i = 0; i < N; ++i) p[i] = p[i] * r[i] + splat(c[0]);
-#if defined(__AVX512F__)
-  for (int i = 0; i < N; ++i) q[i] = _mm512_scalef_ps(p[i], q[i]);
-#else
-  for (int i = 0; i < N; ++i) q[i] = (F)((I)p[i] + ((I)shifted[i] << 23));
-#endif
+inline void alphas_near(F* q) {
+  I whole[N];
+  F m[N], p[N];
+  for (int i = 0; i < N; ++i) whole[i] = to_int(q[i]);
+  for (int i = 0; i < N; ++i) m[i] = mantissa_of(whole[i]);
+  for (int i = 0; i < N; ++i) p[i] = m[i] * splat(3.0597858e-4f) + splat(-3.1397698e-5f);
+  for (int i = 0; i < N; ++i) p[i] = p[i] * m[i] + splat(1.8736185e-3f);
+  for (int i = 0; i < N; ++i) p[i] = p[i] * m[i] + splat(1.7730761e-3f);
+  for (int i = 0; i < N; ++i) q[i] = raised(p[i], whole[i]);
 }
 
 // log2(x) for x > 0, absolute error 2e-6: series of atanh on a mantissa in [0.75, 1.5).
