@@ -3,8 +3,9 @@
 Section IV of the paper: per scene 100 targets in each of three bins of angular distance from a
 source pose, translation offset within +-0.2. What the paper leaves open is fixed here: the
 camera stays upright, an object's target moves about its centre and looks at it, a scene's
-target turns on the spot; elevations stay within +-75 degrees; of a scene only targets that the
-map shows something of are taken, since real maps are not closed all around.
+target turns on the spot; elevations stay within +-75 degrees. Of a scene only targets that the
+map covers and that show an edge somewhere are taken: real maps are not closed all around, and
+a bare ceiling tells nobody where he is.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +32,8 @@ BINS_DEG = ((20.0, 40.0), (40.0, 80.0), (80.0, 180.0))
 SCENE_RADIUS = 0.1  # the paper's, map units
 _MAX_ELEVATION = np.radians(75.0)
 _MIN_COVERED = 0.6  # share of a scene's target that the map must cover
+_MIN_EDGES = 0.05  # share of its cells of 10x10 pixels that must hold an edge
+_EDGE = 6.0  # grey levels a pixel, at 160 pixels
 _TRIES = 200
 _FLOATERS = 20  # Gaussians that may be nearer than the nearest surface
 
@@ -124,14 +128,24 @@ def targets(
 
 
 def shows_enough(gmap: GaussianMap, camera: Camera) -> Callable[[Array], bool]:
-    """Whether a map covers most of a view; for `targets` in scenes."""
-    small = camera.scaled_to_fit(96)
+    """Whether a map covers most of a view and shows any edge there; for `targets` in scenes."""
+    small = camera.scaled_to_fit(160)
 
-    def covered(T_scene_cam: Array) -> bool:
-        _, _, alpha = gmap.render(small, inverse(T_scene_cam))
-        return bool((alpha > 0.5).mean() >= _MIN_COVERED)
+    def enough(T_scene_cam: Array) -> bool:
+        rgb, _, alpha = gmap.render(small, inverse(T_scene_cam))
+        covered = (alpha > 0.5).mean() >= _MIN_COVERED
+        return bool(covered and _edges(rgb) >= _MIN_EDGES)
 
-    return covered
+    return enough
+
+
+def _edges(rgb: NDArray[np.float32]) -> float:
+    """Share of cells of 10x10 pixels that hold an edge."""
+    gray = 255 * cv2.cvtColor(np.clip(rgb, 0, 1), cv2.COLOR_RGB2GRAY)
+    slope = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)) / 4
+    rows, columns = (n // 10 for n in slope.shape)
+    cells = slope[: 10 * rows, : 10 * columns].reshape(rows, 10, columns, 10)
+    return float((cells.max(axis=(1, 3)) > _EDGE).mean())
 
 
 def camera_of(package: MapPackage) -> Camera:
