@@ -20,6 +20,7 @@ from _data import data_folder
 from igaussian_core.compile_map import CompileOptions, compile_map, training_images
 from igaussian_core.evaluate.metrics import QueryOutcome, summarize, to_json
 from igaussian_core.evaluate.photos import PhotoQueries, extent, held_out_images
+from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.evaluate.runner import run
 from igaussian_core.localizer import Localizer
 from igaussian_core.posed_images import PosedImage, read_posed_images
@@ -48,7 +49,9 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         work = arguments.work or Path(temporary)
-        report = {"photos": _photos(work), "cross_scene": _cross_scene(work)}
+        report = {
+            "facts": machine_facts(), "photos": _photos(work), "cross_scene": _cross_scene(work)
+        }  # fmt: skip
     if arguments.json:
         arguments.json.write_text(json.dumps(report, indent=1))
 

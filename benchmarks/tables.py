@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 Row = dict[str, Any]
@@ -82,10 +82,93 @@ def value(figures: Row, key: str) -> str:
     number = figures.get(key)
     if number is None:
         return "–"
-    if key in ("success", "within_15_deg", "within_half_unit", "auc", "inside_95"):
+    if key in ("success", "within_15_deg", "within_half_unit", "inside_95") or "auc" in key:
         return f"{100 * number:.1f} %"
-    if key in ("wrong_accepted", "queries"):
+    if key in ("wrong_accepted", "queries", "accepted"):
         return str(int(number))
     if key.endswith("ms"):
         return f"{number:.0f}"
     return f"{number:.3f}" if key.endswith("deg") else f"{number:.4f}"
+
+
+# --- sections of docs/benchmarks.md ---
+
+
+def _facts(data: Row) -> str:
+    return "; ".join(f"{k}: {v}" for k, v in data.get("facts", {}).items())
+
+
+_PEER_TABLES = {
+    "rendered": "Rendered track (tables 1 and 3 of the paper)",
+    "rotation": "Pure rotation (table 2)",
+    "photos": "Photos that the map was not trained on",
+    "ablation": "Ablation (table 4)",
+    "views": "Number of source views (figure 5)",
+}
+
+
+def peers(data: Row) -> str:
+    """benchmarks/peers.py."""
+    parts = [
+        "## Other methods on the same queries",
+        f"`python benchmarks/peers.py --json out.json`. {_facts(data)}",
+        "Every method gets the same images, the same reference views (renders of the map on the "
+        "rendered track, training photos on the photo track) and the same map. Gradient descent "
+        "from the prior starts at the protocol's source pose (rendered) or 10 degrees and 5 % of "
+        "the extent away (photos). `benchmarks/peer_methods.py` describes each. Photos succeed "
+        "within 5 degrees and 5 % of the cameras' extent, rendered targets within 5 degrees and "
+        "0.05.",
+    ]
+    for name, title in _PEER_TABLES.items():
+        if name in data:
+            parts += [f"### {title}", peers_markdown(name, data[name])]
+    return "\n\n".join(parts)
+
+
+def evaluation(title: str, command: str) -> Callable[[Row], str]:
+    """A section of one output of `igaussian eval`."""
+
+    def section(data: Row) -> str:
+        groups = {"all": data["summary"], **data["groups"]}
+        keys = [key for key in data["summary"] if key != "memory_mb"]
+        rows = [[key, *(value(s, key) for s in groups.values())] for key in keys]
+        stages = [[stage, *(f"{ms:.1f}" for ms in (t["median_ms"], t["p95_ms"]))]
+                  for stage, t in data["stage_times"].items()]  # fmt: skip
+        limits = data["thresholds"]
+        where = "" if limits["distance"] is None else f" and {limits['distance']:.3g} map units"
+        return "\n\n".join([
+            f"## {title}", f"`{command}`. {_facts(data)}",
+            f"Success: within {limits['deg']:g} degrees{where}.",
+            markdown(["figure", *groups], rows),
+            markdown(["stage", "median ms", "95 % ms"], stages),
+        ])  # fmt: skip
+
+    return section
+
+
+def photos(data: Row) -> str:
+    """benchmarks/photos.py."""
+    keys = ("success", "wrong_accepted", "median_deg", "median_distance", "p90_deg",
+            "p90_distance", "coarse_median_deg", "coarse_median_distance", "mean_nees",
+            "median_ms")  # fmt: skip
+    rows = [[row["case"], value(row["summary"], "queries"),
+             *(value(row["summary"], key) for key in keys)] for row in data["photos"]]  # fmt: skip
+    crossed = [[row["map"], str(row["photos"]), str(row["accepted"]), str(row["inliers"])]
+               for row in data["cross_scene"]]  # fmt: skip
+    return "\n\n".join([
+        "## Real photos, from nothing", f"`python benchmarks/photos.py --json out.json`. "
+        f"{_facts(data)}", markdown(["set", "queries", *keys], rows),
+        "Photos of other scenes, all of which must be refused:",
+        markdown(["map", "photos", "accepted", "most inliers"], crossed),
+    ])  # fmt: skip
+
+
+# by the name of the file in results/, in the page's order
+SECTIONS: dict[str, Callable[[Row], str]] = {
+    "peers": peers,
+    "demo_rendered": evaluation(
+        "The demo room, the paper's protocol",
+        "igaussian eval rendered --map room.igmap --json out.json --report report.html",
+    ),
+    "photos": photos,
+}
