@@ -1,21 +1,29 @@
-"""Times and accuracy of the CPU renderer, by scene, instruction set and number of threads.
+"""Times, accuracy and memory of the CPU renderer, beside its oracle and other renderers.
 
-    python benchmarks/render.py [--json out.json] [--scenes 50000,100000,...] [--repeats 30]
+    python benchmarks/render.py --json out.json
+    python benchmarks/make_docs.py --keep out.json render       puts them into docs/benchmarks.md
 
 Scenes are furnished rooms of surface-aligned Gaussians, SH 3, made here; the maps of the data
 folder come on top where it is there (IGAUSSIAN_DATA, else ../shared/data). Images are 640x480,
 RGB, depth and alpha. Wall times are what a caller waits, CPU times what the process spends (on a
 machine with other work the better measure for one thread); each is a median with its quartiles
-over the repeats. The torch reference runs on one thread in float32 with 32-pixel tiles; accuracy
-is judged by the same in float64.
+over the repeats. The torch reference runs once, on one thread, in float32 with 32-pixel tiles;
+accuracy is judged by the same in float64.
+
+Other renderers run where they are installed: `pip install gsplat==1.5.3 "gausscam[webgpu]"
+splax` into an environment that has this package (none of them is a dependency).
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
+import gc
 import json
 import os
-import platform
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,16 +31,24 @@ from typing import Any
 
 import numpy as np
 import torch
+from render_peers import run_peers
+from render_tables import section
 
 from igaussian_core.camera import Camera
+from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.gaussian_map import load_map
 from igaussian_core.posed_images import read_posed_images
 from igaussian_core.render import Rasterizer, available_simd
 from igaussian_core.render import reference as oracle
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+PIXELS = CAMERA.width * CAMERA.height
 MAPS = ("fox", "lego", "redkitchen", "flower", "fern")
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Views = list[tuple[Camera, np.ndarray]]
+
+
+# --- scenes ---
 
 
 def furnished_room(count: int, seed: int = 0, coverage: float = 0.72) -> Arrays:
@@ -95,123 +111,7 @@ def room_pose() -> np.ndarray:
     return T
 
 
-def timed(call: Callable[[], Any], repeats: int) -> dict[str, list[float]]:
-    """Quartiles of wall and CPU milliseconds, after two calls to warm up."""
-    wall, cpu = [], []
-    for i in range(repeats + 2):
-        start_wall, start_cpu = time.perf_counter(), time.process_time()
-        call()
-        if i >= 2:
-            wall.append((time.perf_counter() - start_wall) * 1e3)
-            cpu.append((time.process_time() - start_cpu) * 1e3)
-    quartiles = [25, 50, 75]
-    return {
-        "wall_ms": np.percentile(wall, quartiles).round(2).tolist(),
-        "cpu_ms": np.percentile(cpu, quartiles).round(2).tolist(),
-        "best_wall_ms": [round(min(wall), 2)],
-    }
-
-
-def run_kernel(
-    arrays: Arrays,
-    views: list[tuple[Camera, np.ndarray]],
-    repeats: int,
-    simd_names: tuple[str, ...],
-    antialiased: bool = False,
-) -> list[dict[str, Any]]:
-    results = []
-    for simd in simd_names:
-        rasterizer = Rasterizer(*arrays, antialiased=antialiased, simd=simd)
-        for threads in (1, 2):
-            shares = []
-
-            def frame(
-                rasterizer: Rasterizer = rasterizer,
-                threads: int = threads,
-                shares: list[tuple[float, ...]] = shares,
-            ) -> None:
-                camera, T = views[len(shares) % len(views)]
-                rasterizer.render(camera, T, threads=threads)
-                shares.append(rasterizer.stats[:3])
-
-            times = timed(frame, max(repeats, len(views)))
-            busy = np.median(shares, axis=0)
-            results.append(
-                {
-                    "simd": simd,
-                    "threads": threads,
-                    **times,
-                    "project_sort_blend_percent": (100 * busy / busy.sum()).round().tolist(),
-                    "visible": rasterizer.stats.visible,
-                    "lanes_per_pixel": round(rasterizer.stats.cells * 16 / 307200, 1),
-                }
-            )
-    return results
-
-
-def run_oracle(arrays: Arrays, T: np.ndarray) -> tuple[dict[str, Any], Any]:
-    """Figures of the reference in float32 on one thread, and its images in float64."""
-    torch.set_num_threads(1)
-    tensors = [torch.tensor(array) for array in arrays]
-    pose = torch.tensor(T, dtype=torch.float32)
-    with torch.no_grad():
-        times = timed(lambda: oracle.render_reference(*tensors, CAMERA, pose), 1)
-        pairs = 0
-        for row in oracle.tiles(oracle.project(*tensors, CAMERA, pose), CAMERA, 32):
-            for tile in row:
-                pairs += int((oracle.weights(tile.gaussians, tile.pixels) > 0).sum())
-        exact = [tensor.double() for tensor in tensors]
-        images = oracle.render_reference(*exact, CAMERA, torch.tensor(T))
-    figures = {
-        "wall_ms": round(times["wall_ms"][1]),
-        "cpu_ms": round(times["cpu_ms"][1]),
-        "million_contributions": round(pairs / 1e6, 2),
-    }
-    return figures, images
-
-
-def accuracy(arrays: Arrays, T: np.ndarray, truth: Any, simd: str) -> dict[str, Any]:
-    render = Rasterizer(*arrays, simd=simd).render(CAMERA, T)
-    error = np.abs(render.rgb - truth.rgb.numpy())
-    solid = truth.alpha.numpy() > 0.5
-    depth = np.abs(render.depth / np.maximum(truth.depth.numpy(), 1e-9) - 1)[solid]
-    return {
-        "simd": simd,
-        "rgb_99_percent": float(np.quantile(error, 0.99)),
-        "rgb_99_99_percent": float(np.quantile(error, 0.9999)),
-        "rgb_max": float(error.max()),
-        "depth_relative_99_99_percent": float(np.quantile(depth, 0.9999)),
-        "depth_relative_max": float(depth.max()),
-    }
-
-
-def run_gradients(arrays: Arrays, T: np.ndarray, repeats: int) -> dict[str, Any]:
-    rasterizer = Rasterizer(*arrays)
-    by_rgb = np.random.default_rng(0).normal(size=(480, 640, 3)).astype(np.float32)
-    times = timed(
-        lambda: rasterizer.gradients(CAMERA, T, arrays, rgb=by_rgb, threads=1), repeats
-    )
-    packing = timed(lambda: Rasterizer(*arrays), 3)
-    return {"threads": 1, **times, "packing_cpu_ms": packing["cpu_ms"][1]}
-
-
-def run_batch(arrays: Arrays, T: np.ndarray, repeats: int) -> dict[str, Any]:
-    """64 views of 80x60, one by one and in one call, two threads."""
-    rasterizer = Rasterizer(*arrays)
-    camera = CAMERA.resized(80, 60)
-    poses = np.tile(T, (64, 1, 1))
-    poses[:, 0, 3] += np.linspace(-0.3, 0.3, 64)
-    loop = timed(lambda: [rasterizer.render(camera, P, threads=2) for P in poses], repeats)
-    batch = timed(lambda: rasterizer.render_batch(camera, poses, threads=2), repeats)
-    return {
-        "views": 64,
-        "size": [80, 60],
-        "one_by_one_wall_ms": loop["wall_ms"],
-        "batch_wall_ms": batch["wall_ms"],
-    }
-
-
-def map_views(folder: Path, count: int = 8) -> list[tuple[Camera, np.ndarray]]:
+def map_views(folder: Path, count: int = 8) -> Views:
     """Views of a set's own cameras, at most 640 pixels a side."""
     images = read_posed_images(folder / "poses.json")
     views = []
@@ -229,17 +129,179 @@ def data_maps() -> tuple[list[Path], str]:
     return found, "" if found else f"{folder}: no maps there (set IGAUSSIAN_DATA)"
 
 
+# --- times ---
+
+
+def timed(call: Callable[[], Any], repeats: int, warm_up: int = 2) -> dict[str, Any]:
+    """Quartiles of wall and CPU milliseconds, and the least of each."""
+    wall, cpu = [], []
+    for i in range(repeats + warm_up):
+        start_wall, start_cpu = time.perf_counter(), time.process_time()
+        call()
+        if i >= warm_up:
+            wall.append((time.perf_counter() - start_wall) * 1e3)
+            cpu.append((time.process_time() - start_cpu) * 1e3)
+    quartiles = [25, 50, 75]
+    return {
+        "wall_ms": np.percentile(wall, quartiles).round(2).tolist(),
+        "cpu_ms": np.percentile(cpu, quartiles).round(2).tolist(),
+        "least_wall_ms": round(min(wall), 2),
+        "least_cpu_ms": round(min(cpu), 2),
+    }
+
+
+def run_kernel(
+    arrays: Arrays, views: Views, repeats: int, antialiased: bool = False
+) -> list[dict[str, Any]]:
+    """One row for each instruction set and number of threads."""
+    return [
+        _frames(Rasterizer(*arrays, antialiased=antialiased, simd=simd), views, threads, repeats)
+        for simd in available_simd()
+        for threads in (1, 2)
+    ]
+
+
+def _frames(
+    rasterizer: Rasterizer, views: Views, threads: int, repeats: int
+) -> dict[str, Any]:
+    stats = []
+
+    def frame() -> None:
+        camera, T = views[len(stats) % len(views)]
+        rasterizer.render(camera, T, threads=threads)
+        stats.append(rasterizer.stats)
+
+    times = timed(frame, max(repeats, len(views)))
+    busy = np.median([s[:3] for s in stats], axis=0)
+    pixels = views[0][0].width * views[0][0].height
+    return {
+        "simd": rasterizer.simd,
+        "threads": threads,
+        **times,
+        "project_sort_blend_percent": (100 * busy / busy.sum()).round().tolist(),
+        "visible": int(np.median([s.visible for s in stats])),
+        "lanes_per_pixel": round(float(np.median([s.cells for s in stats])) * 16 / pixels, 1),
+    }
+
+
+def run_gradients(arrays: Arrays, T: np.ndarray, repeats: int) -> dict[str, Any]:
+    rasterizer = Rasterizer(*arrays)
+    by_rgb = np.random.default_rng(0).normal(size=(480, 640, 3)).astype(np.float32)
+    times = timed(
+        lambda: rasterizer.gradients(CAMERA, T, arrays, rgb=by_rgb, threads=1), repeats
+    )
+    packing = timed(lambda: Rasterizer(*arrays), 3, warm_up=1)
+    return {"threads": 1, **times, "packing_cpu_ms": packing["cpu_ms"][1]}
+
+
+def run_batch(arrays: Arrays, T: np.ndarray, repeats: int) -> dict[str, Any]:
+    """64 views of 64x64, one by one and in one call, two threads."""
+    rasterizer = Rasterizer(*arrays)
+    camera = Camera(64, 64, 52.5, 52.5, 31.5, 31.5)
+    poses = np.tile(T, (64, 1, 1))
+    poses[:, 0, 3] += np.linspace(-0.3, 0.3, 64)
+    loop = timed(lambda: [rasterizer.render(camera, P, threads=2) for P in poses], repeats)
+    batch = timed(lambda: rasterizer.render_batch(camera, poses, threads=2), repeats)
+    return {"views": 64, "one_by_one_wall_ms": loop["wall_ms"], "batch_wall_ms": batch["wall_ms"]}
+
+
+# --- against the oracle ---
+
+
+def run_oracle(arrays: Arrays, T: np.ndarray) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Figures of the float32 reference on one thread, and of all against the float64 one."""
+    torch.set_num_threads(1)
+    tensors = [torch.tensor(array) for array in arrays]
+    pose = torch.tensor(T, dtype=torch.float32)
+    single: list[oracle.ReferenceRender] = []
+    with torch.no_grad():
+        times = timed(
+            lambda: single.append(oracle.render_reference(*tensors, CAMERA, pose)), 1, warm_up=0
+        )
+        pairs = 0
+        for row in oracle.tiles(oracle.project(*tensors, CAMERA, pose), CAMERA, 32):
+            for tile in row:
+                pairs += int((oracle.weights(tile.gaussians, tile.pixels) > 0).sum())
+        exact = [tensor.double() for tensor in tensors]
+        truth = oracle.render_reference(*exact, CAMERA, torch.tensor(T))
+    figures = {"cpu_ms": round(times["cpu_ms"][1]), "contributions_per_pixel": pairs / PIXELS}
+    errors = [
+        {"of": simd, **difference(Rasterizer(*arrays, simd=simd).render(CAMERA, T), truth)}
+        for simd in available_simd()
+    ]
+    reference = oracle.ReferenceRender(*(part.numpy() for part in single[0]))
+    return figures, [*errors, {"of": "the reference in float32", **difference(reference, truth)}]
+
+
+def difference(render: Any, truth: oracle.ReferenceRender) -> dict[str, Any]:
+    """Colour as it is, depth relative and where alpha > 0.5."""
+    colour = np.abs(render.rgb - truth.rgb.numpy()).max(axis=2)
+    solid = truth.alpha.numpy() > 0.5
+    depth = np.abs(render.depth[solid] / truth.depth.numpy()[solid] - 1)
+    return {
+        "rgb_99_percent": float(np.quantile(colour, 0.99)),
+        "rgb_max": float(colour.max()),
+        "rgb_pixels_above_2e-3": int((colour > 2e-3).sum()),
+        "depth_99_99_percent": float(np.quantile(depth, 0.9999)),
+        "depth_max": float(depth.max()),
+    }
+
+
+# --- memory ---
+
+
+def run_memory(count: int = 3_000_000) -> dict[str, Any]:
+    """Of a large map, in a process of its own: what stays is not blurred by what was freed."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "memory.json"
+        command = [sys.executable, __file__, "--memory-of", str(count), "--json", str(file)]
+        subprocess.run(command, check=True)
+        figures: dict[str, Any] = json.loads(file.read_text())
+    return figures
+
+
+def memory_of(count: int) -> dict[str, Any]:
+    arrays, T = furnished_room(count), room_pose()
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)  # what making them left behind
+    start = _resident_mb()
+    rasterizer = Rasterizer(*arrays)
+    packed = _resident_mb() - start
+    figures = {
+        "gaussians": count,
+        "arrays_mb": round(sum(array.nbytes for array in arrays) / 1e6),
+        "packed_mb": round(packed),
+    }
+    for name, camera in (("640x480", CAMERA), ("1920x1080", CAMERA.resized(1920, 1080))):
+        times = timed(lambda camera=camera: rasterizer.render(camera, T, threads=2), 5)
+        figures[name] = {
+            "wall_ms": times["wall_ms"],
+            "with_frame_buffers_mb": round(_resident_mb() - start),
+        }
+    return figures
+
+
+def _resident_mb() -> float:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmRSS"):
+            return int(line.split()[1]) / 1e3
+    raise OSError("/proc/self/status has no VmRSS")
+
+
+# --- the run ---
+
+
 def room_report(count: int, repeats: int, with_oracle: bool) -> dict[str, Any]:
     arrays, T = furnished_room(count), room_pose()
     report: dict[str, Any] = {
         "scene": f"room, {count:,}",
-        "kernel": run_kernel(arrays, [(CAMERA, T)], repeats, available_simd()),
+        "gaussians": count,
+        "kernel": run_kernel(arrays, [(CAMERA, T)], repeats),
         "gradients": run_gradients(arrays, T, max(3, repeats // 3)),
         "batch": run_batch(arrays, T, max(3, repeats // 10)),
     }
     if with_oracle:
-        report["oracle"], images = run_oracle(arrays, T)
-        report["accuracy"] = [accuracy(arrays, T, images, simd) for simd in available_simd()]
+        report["oracle"], report["accuracy"] = run_oracle(arrays, T)
     return report
 
 
@@ -250,72 +312,38 @@ def map_report(folder: Path, repeats: int) -> dict[str, Any]:
     camera = views[0][0]
     return {
         "scene": f"{folder.name}, {len(gmap):,}, {camera.width}x{camera.height}",
-        "kernel": run_kernel(arrays, views, repeats, available_simd(), gmap.antialiased),
+        "gaussians": len(gmap),
+        "kernel": run_kernel(arrays, views, repeats, gmap.antialiased),
     }
-
-
-def table(*columns: str) -> None:
-    print("\n| " + " | ".join(columns) + " |")
-    print("|---" * len(columns) + "|")
-
-
-def print_tables(reports: list[dict[str, Any]]) -> None:
-    table("scene", "path", "1 thread, CPU ms", "2 threads, wall ms", "best", "project/sort/blend %")
-    for report in reports:
-        for one, two in zip(report["kernel"][::2], report["kernel"][1::2], strict=True):
-            cpu, wall = one["cpu_ms"], two["wall_ms"]
-            share = "/".join(f"{p:.0f}" for p in one["project_sort_blend_percent"])
-            print(
-                f"| {report['scene']} | {one['simd']} | {cpu[1]:.1f} ({cpu[0]:.1f}-{cpu[2]:.1f}) "
-                f"| {wall[1]:.1f} ({wall[0]:.1f}-{wall[2]:.1f}) | {two['best_wall_ms'][0]:.1f} "
-                f"| {share} |"
-            )
-    rooms = [report for report in reports if "oracle" in report]
-    if rooms:
-        table("scene", "contributions", "torch reference, CPU ms", "times the kernel")
-        for report in rooms:
-            reference = report["oracle"]
-            ratio = reference["cpu_ms"] / report["kernel"][0]["cpu_ms"][1]
-            print(
-                f"| {report['scene']} | {reference['million_contributions']} M "
-                f"| {reference['cpu_ms']} | {ratio:.0f} |"
-            )
-        table("scene", "path", "RGB 99 %", "99.99 %", "max", "depth (relative) 99.99 %", "max")
-        for report in rooms:
-            for a in report["accuracy"]:
-                values = [f"{value:.1e}" for value in list(a.values())[1:]]
-                print(f"| {report['scene']} | {a['simd']} | {' | '.join(values)} |")
-    table("scene", "gradients, CPU ms", "packing, CPU ms", "64 views 80x60, wall ms", "batch")
-    for report in reports:
-        if "gradients" in report:
-            gradients, batch = report["gradients"], report["batch"]
-            print(
-                f"| {report['scene']} | {gradients['cpu_ms'][1]} | {gradients['packing_cpu_ms']} "
-                f"| {batch['one_by_one_wall_ms'][1]} | {batch['batch_wall_ms'][1]} |"
-            )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, help="where to write all figures")
     parser.add_argument("--scenes", default="50000,100000,500000,1000000")
-    parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--repeats", type=int, default=40)
     parser.add_argument("--no-oracle", action="store_true", help="leave the slow reference out")
+    parser.add_argument("--memory-of", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    reports = []
+    if arguments.memory_of:
+        arguments.json.write_text(json.dumps(memory_of(arguments.memory_of)))
+        return
+    data: dict[str, Any] = {"facts": machine_facts(), "scenes": []}
     for count in filter(None, arguments.scenes.split(",")):
-        reports.append(room_report(int(count), arguments.repeats, not arguments.no_oracle))
-        print(f"{reports[-1]['scene']}: done", flush=True)
+        report = room_report(int(count), arguments.repeats, not arguments.no_oracle)
+        data["scenes"].append(report)
+        print(f"{report['scene']}: done", flush=True)
     folders, reason = data_maps()
     if reason:
         print(f"maps skipped: {reason}")
     for folder in folders:
-        reports.append(map_report(folder, arguments.repeats))
-        print(f"{reports[-1]['scene']}: done", flush=True)
-    print_tables(reports)
+        data["scenes"].append(map_report(folder, arguments.repeats))
+        print(f"{folder.name}: done", flush=True)
+    data["memory"] = run_memory()
+    data["peers"] = run_peers(furnished_room(50_000), CAMERA, room_pose())
     if arguments.json:
-        machine = {"cpus": os.cpu_count(), "machine": platform.machine(), "load": os.getloadavg()}
-        arguments.json.write_text(json.dumps({"machine": machine, "scenes": reports}, indent=1))
+        arguments.json.write_text(json.dumps(data, indent=1))
+    print("\n" + section(data))
 
 
 if __name__ == "__main__":
