@@ -75,7 +75,6 @@ VIEW_COUNTS = {
     8: (-30.0, 30.0), 12: (-45.0, 0.0, 45.0), 16: (-60.0, -30.0, 30.0, 60.0),
     20: (-60.0, -30.0, 0.0, 30.0, 60.0),
 }  # fmt: skip
-_REFERENCES = 80  # most views that the peers are given
 
 
 class NotBuilt(Exception):
@@ -163,9 +162,10 @@ class Scale:
     photos: int  # most photos a set
     slow_photos: int
     steps: int = 200  # of gradient descent
+    references: int = 80  # most views that the peers are given
 
 
-FULL, QUICK = Scale(30, 2, 30, 3), Scale(2, 1, 2, 1, steps=20)
+FULL, QUICK = Scale(30, 2, 30, 3), Scale(2, 1, 2, 1, steps=20, references=20)
 
 
 def main() -> None:
@@ -320,7 +320,7 @@ def _rendered_case(
 
     def references() -> list[Reference]:
         count = package.landmarks.view_count
-        chosen = np.unique(np.linspace(0, count - 1, min(count, _REFERENCES)).astype(int))
+        chosen = np.unique(np.linspace(0, count - 1, min(count, scale.references)).astype(int))
         return [reference_of_map(package, int(view), CONFIG) for view in chosen]
 
     limit = math.inf if pure_rotation else 0.05
@@ -360,7 +360,7 @@ def _photo_case(name: str, work: Path, scale: Scale) -> Case:
         ground = tuple(round(255 * value) for value in (red, green, blue))
         return [
             reference_of_photo(package, i.read(ground), i.camera, i.T_scene_cam, CONFIG)  # type: ignore[arg-type]
-            for i in _spread(training, _REFERENCES)
+            for i in _spread(training, scale.references)
         ]
 
     return Case(name, package, functools.cache(references), queries, 5.0, 0.05 * size, scale.steps)

@@ -333,7 +333,7 @@ def _evaluate(
         "map": f"{map_path} ({manifest.kind}, {manifest.source_file})", **facts,
         "processes": str(jobs), **machine_facts(),
     }  # fmt: skip
-    title = f"iGaussian: {track} track, {manifest.name}"
+    title = f"iGaussian: {track} track, {map_path.stem}"
     evaluation = Evaluation(
         title, track, done.outcomes, *limits, done.memory_mb, config, facts
     )
