@@ -461,8 +461,8 @@ class LocalizerNode(Node):
         live, pinhole = camera.undistort(image)  # type: ignore[arg-type]
         render = None
         if result.T_map_cam is not None:
-            rgb, _, _ = tracker.localizer.render(pinhole, result.T_map_cam)
-            render = overlay.to_u8(rgb)
+            rgb, _, alpha = tracker.localizer.render(pinhole, result.T_map_cam)
+            render = overlay.in_colours_of(live, rgb, alpha)
         picture = overlay.compare(live, render, self._settings["overlay_mode"])
         picture = overlay.captioned(picture, overlay.caption(result), result.ok)
         header = Header(stamp=message.header.stamp, frame_id=self._pipeline.camera_frame(message))

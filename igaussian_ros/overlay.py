@@ -6,10 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from igaussian_core.colour import match_colours
 from igaussian_core.result import LocalizationResult
 
 Image = NDArray[np.uint8]
 _BAR = 22  # height of the caption in pixels
+_SOLID = 0.9  # alpha of pixels whose colours are compared
 
 
 def compare(live: Image, render: Image | None, mode: str) -> Image:
@@ -53,6 +55,9 @@ def caption(result: LocalizationResult) -> str:
     )
 
 
-def to_u8(rgb: NDArray[np.float32]) -> Image:
-    """uint8 of a render in [0, 1]."""
-    return (np.clip(rgb, 0, 1) * 255 + 0.5).astype(np.uint8)
+def in_colours_of(
+    live: Image, rgb: NDArray[np.float32], alpha: NDArray[np.float32]
+) -> Image:
+    """uint8 of a render, in the live image's exposure where a fit is plausible."""
+    matched = match_colours(rgb, live, alpha > _SOLID)
+    return (np.clip(matched, 0, 1) * 255 + 0.5).astype(np.uint8)

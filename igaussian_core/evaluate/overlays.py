@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igaussian_core.camera import Camera
+from igaussian_core.colour import match_colours
 from igaussian_core.localizer import Localizer
 
 Image = NDArray[np.uint8]
+_SOLID = 0.9  # alpha of pixels whose colours are compared
 
 
 @dataclass(frozen=True)
@@ -47,10 +49,11 @@ def make_pair(
     T_map_cam: NDArray[np.float64],
     max_side: int = 640,
 ) -> Pair:
-    """An image, shrunk and undistorted, and the map's render at a pose."""
+    """An image, shrunk and undistorted, and the map's render at a pose in the image's exposure."""
     small_camera = camera.scaled_to_fit(max_side)
     size = (small_camera.width, small_camera.height)
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     live, pinhole = small_camera.undistort(np.asarray(small, np.uint8))
-    rgb, _, _ = localizer.render(pinhole, T_map_cam)
-    return Pair(live, (np.clip(rgb, 0, 1) * 255 + 0.5).astype(np.uint8))
+    rgb, _, alpha = localizer.render(pinhole, T_map_cam)
+    matched = match_colours(rgb, live, alpha > _SOLID)
+    return Pair(live, (np.clip(matched, 0, 1) * 255 + 0.5).astype(np.uint8))

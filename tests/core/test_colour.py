@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from igaussian_core.colour import ColourFit, fit_colour
+from igaussian_core.camera import Camera
+from igaussian_core.colour import ColourFit, fit_colour, match_colours
 from igaussian_core.errors import ImageError
+from igaussian_core.evaluate.overlays import make_pair
 
 GAIN, OFFSET = np.array([1.25, 0.9, 0.65]), np.array([-0.04, 0.05, 0.12])
 
@@ -104,6 +106,38 @@ def test_too_few_pixels_change_nothing() -> None:
     assert fit.pixels == 0
     assert np.array_equal(fit.apply(render), render.astype(np.float32))
     assert np.array_equal(ColourFit.identity().gain, np.ones(3))
+
+
+def test_a_fit_of_another_scene_is_not_plausible() -> None:
+    render = picture()
+    noise = np.random.default_rng(3).normal(0, 0.02, render.shape)
+    assert fit_colour(render * GAIN + OFFSET + noise, render).plausible
+    assert not fit_colour(picture(1), render).plausible
+    assert not fit_colour(0.5 + 0.01 * render, render).plausible  # gain at its bound
+    assert not ColourFit.identity().plausible
+
+
+def test_colours_are_matched_where_that_is_plausible() -> None:
+    render = picture()
+    image = render * GAIN + OFFSET
+    assert np.abs(match_colours(render, image) - image).max() < 1e-3
+    unchanged = match_colours(render, picture(1))
+    assert unchanged.dtype == np.float32
+    np.testing.assert_array_equal(unchanged, render.astype(np.float32))
+
+
+def test_reports_show_the_map_in_the_exposure_of_the_photo() -> None:
+    render = picture().astype(np.float32)
+    photo = np.rint((render * 0.6 + 0.05) * 255).astype(np.uint8)
+    camera = Camera(render.shape[1], render.shape[0], 100, 100, 60, 45)
+
+    class OneView:
+        def render(self, camera: Camera, T_map_cam: np.ndarray) -> tuple[np.ndarray, ...]:
+            depth = np.ones(render.shape[:2], np.float32)
+            return render, depth, depth
+
+    pair = make_pair(OneView(), photo, camera, np.eye(4))  # type: ignore[arg-type]
+    assert np.abs(pair.render.astype(int) - photo).max() <= 2
 
 
 def test_sizes_that_differ_are_refused() -> None:

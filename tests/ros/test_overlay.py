@@ -53,4 +53,15 @@ def test_the_caption_gives_evidence_or_the_reason():
 
 def test_renders_are_clipped_and_rounded():
     rgb = np.array([[[-0.1, 0.5, 1.2]]], np.float32)
-    np.testing.assert_array_equal(overlay.to_u8(rgb), [[[0, 128, 255]]])
+    picture = overlay.in_colours_of(LIVE[:1, :1], rgb, np.ones((1, 1), np.float32))
+    np.testing.assert_array_equal(picture, [[[0, 128, 255]]])
+
+
+def test_a_render_is_shown_in_the_exposure_of_the_live_image():
+    rgb = np.random.default_rng(0).random((60, 80, 3)).astype(np.float32)
+    live = (rgb * 0.5 * 255 + 20).astype(np.uint8)
+    picture = overlay.in_colours_of(live, rgb, np.ones((60, 80), np.float32))
+    assert np.abs(picture.astype(int) - live).max() <= 2
+    other = np.random.default_rng(1).integers(0, 255, LIVE.shape, np.uint8)
+    unchanged = overlay.in_colours_of(other, rgb, np.ones((60, 80), np.float32))
+    np.testing.assert_array_equal(unchanged, (rgb * 255 + 0.5).astype(np.uint8))
