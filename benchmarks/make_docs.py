@@ -3,7 +3,7 @@
     python benchmarks/make_docs.py                    write docs/benchmarks.md
     python benchmarks/make_docs.py --keep out.json NAME   first take an output into results/
 
-A section is a function of its JSON in `tables.SECTIONS`. What is kept of `igaussian eval` are
+A section is a function of its JSON in `SECTIONS`. What is kept of `igaussian eval` are
 the figures, not the single queries.
 """
 
@@ -11,13 +11,26 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from tables import SECTIONS
+import render_tables
+import tables
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 PAGE = ROOT / "docs" / "benchmarks.md"
+# by the name of the file in results/, in the page's order
+SECTIONS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "peers": tables.peers,
+    "demo_rendered": tables.evaluation(
+        "The demo room, the paper's protocol",
+        "igaussian eval rendered --map room.igmap --json out.json --report report.html",
+    ),
+    "photos": tables.photos,
+    "render": render_tables.section,
+}
 _HEAD = """# Benchmarks
 
 Made by `python benchmarks/make_docs.py` from `benchmarks/results/`; not edited by hand. Each

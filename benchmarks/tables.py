@@ -161,14 +161,3 @@ def photos(data: Row) -> str:
         "Photos of other scenes, all of which must be refused:",
         markdown(["map", "photos", "accepted", "most inliers"], crossed),
     ])  # fmt: skip
-
-
-# by the name of the file in results/, in the page's order
-SECTIONS: dict[str, Callable[[Row], str]] = {
-    "peers": peers,
-    "demo_rendered": evaluation(
-        "The demo room, the paper's protocol",
-        "igaussian eval rendered --map room.igmap --json out.json --report report.html",
-    ),
-    "photos": photos,
-}
