@@ -1,6 +1,6 @@
 """The paper's tables and real photos, with other methods on the same queries and machine.
 
-    python benchmarks/peers.py [--quick] [--json benchmarks/results/peers.json] [--work folder]
+    python benchmarks/peers.py [--quick] [--json out.json] [--work folder]
 
 Tables: the rendered track (layout of the paper's tables 1 and 3), pure rotation (table 2),
 photos, the ablation (table 4), the number of source views (figure 5). Methods are described in
@@ -174,16 +174,24 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "peers")
     parser.add_argument("--quick", action="store_true", help="few queries: does it run?")
     parser.add_argument("--only", help="one table: rendered, rotation, photos, ablation, views")
+    parser.add_argument("--targets", type=int, help=f"in each bin, {FULL.each} by default")
+    parser.add_argument("--photos", type=int, help=f"most of a set, {FULL.photos} by default")
     options = parser.parse_args()
     scale = QUICK if options.quick else FULL
-    work = options.work / ("quick" if options.quick else "full")
+    scale = dataclasses.replace(
+        scale, each=options.targets or scale.each, photos=options.photos or scale.photos
+    )
+    work = options.work / f"{scale.each}-{scale.photos}-{scale.references}"
     work.mkdir(parents=True, exist_ok=True)
     tables = {
         "rendered": _rendered_table, "rotation": _rotation_table, "photos": _photo_table,
         "ablation": _ablation_table, "views": _views_table,
     }  # fmt: skip
     report: dict[str, Any] = {"facts": {**machine_facts(), "commit": _commit()}}
-    report["facts"]["run"] = "quick" if options.quick else "full"
+    report["facts"]["queries"] = (
+        f"{scale.each} targets a bin ({scale.slow_each} for gradient descent), at most "
+        f"{scale.photos} photos a set ({scale.slow_photos})"
+    )
     for name, make in tables.items():
         if options.only in (None, name):
             report[name] = make(work, scale)
