@@ -68,6 +68,31 @@ class CoarseConfig:
 class RefineConfig:
     """Stage two: match the image with a render at the hypothesis, PnP with rendered depth."""
 
+    matcher: str = _option(
+        "auto",
+        "what matches image and render where following points does not convince; auto: the "
+        "keypoints that the map was compiled with",
+        choices=("auto", "xfeat", "xfeat_semi_dense", "loftr", "sift"),
+    )
+    loftr_weights: str = _option("", "checkpoint file of LoFTR, see docs/matchers.md")
+    guided_radius_px: float = _option(
+        40.0, "radius around the prior's place within which keypoints are matched when "
+        "tracking; 0: they are matched as from nothing", 0, 1000
+    )  # fmt: skip
+    solver: str = _option(
+        "pnp",
+        "pnp: 2D-3D with the rendered depth; paper: essential matrix, its scale from elsewhere",
+        choices=("pnp", "paper"),
+    )
+    scale: str = _option(
+        "depth",
+        "where solver=paper takes the translation's length from; depth: the median ratio of "
+        "rendered and triangulated depth",
+        choices=("depth",),
+    )
+    max_sampson_px: float = _option(
+        1.0, "inlier threshold of the essential matrix, Sampson error in pixels", 0.1, 32
+    )
     align_points: int = _option(
         400, "points of a render that are followed into the image", 16, 4096
     )

@@ -94,12 +94,17 @@ class XFeatMatcher:
             )
         kornia_feature: Any = KF
         self._xfeat: Any = kornia_feature.XFeat()
-        _load_strictly(self._xfeat.net, _read_weights("xfeat.pt"), "xfeat.pt")
+        load_strictly(self._xfeat.net, _read_weights("xfeat.pt"), "xfeat.pt")
         self._xfeat.eval().to(memory_format=torch.channels_last)
         light_glue: Any = kornia_feature.LightGlue
         self._glue: Any = light_glue(None, **_lighterglue_config(light_glue))
-        _load_strictly(self._glue, _lighterglue_state(self._glue), "xfeat-lighterglue.pt")
+        load_strictly(self._glue, _lighterglue_state(self._glue), "xfeat-lighterglue.pt")
         self._glue.eval()
+
+    @property
+    def net(self) -> Any:
+        """XFeat's network: descriptors, keypoint logits and reliability of cells of 8 pixels."""
+        return self._xfeat.net
 
     @torch.inference_mode()
     def extract(self, image: NDArray[np.uint8], keypoints: int) -> Features:
@@ -213,10 +218,10 @@ def _glue_input(features: Features) -> dict[str, torch.Tensor]:
 def _lighterglue_config(light_glue: Any) -> dict[str, Any]:
     """kornia's settings for XFeat, without pruning: on a CPU it costs more than it saves."""
     settings = {**light_glue.features["xfeat"], "weights": None, "width_confidence": -1}
-    return {**settings, "mp": _has_native_bfloat16()}
+    return {**settings, "mp": has_native_bfloat16()}
 
 
-def _has_native_bfloat16() -> bool:
+def has_native_bfloat16() -> bool:
     """bfloat16 matching is 1.6 times faster where the CPU computes in it, slower elsewhere."""
     query = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
     return bool(query is not None and query())
@@ -237,8 +242,17 @@ def _lighterglue_state(model: Any) -> dict[str, torch.Tensor]:
     return {k: v for k, v in state.items() if not k.startswith("extractor.")}
 
 
-def _load_strictly(model: Any, state: dict[str, torch.Tensor], name: str) -> None:
-    missing, unexpected = model.load_state_dict(state, strict=False)
+def load_strictly(model: Any, state: dict[str, torch.Tensor], name: str) -> None:
+    """Load weights of which none may be missing, left over or of another shape.
+
+    Raises:
+        WeightsError: names the file and what does not fit.
+    """
+    try:
+        missing, unexpected = model.load_state_dict(state, strict=False)
+    except RuntimeError as error:  # shapes
+        cause = " ".join(str(error).split())[:300]
+        raise WeightsError(f"{name}: does not fit the network: {cause}") from error
     if missing or unexpected:
         raise WeightsError(
             f"{name}: does not fit the network: missing {missing}, unexpected {unexpected}"

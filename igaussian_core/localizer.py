@@ -98,7 +98,9 @@ class Localizer:
             Status.NO_HYPOTHESIS, "no place in the map resembles the image", source="landmarks"
         )
         for hypothesis in self._hypotheses(query, prior):
-            refinement = self._refiner.refine(query, hypothesis.T_scene_cam)
+            refinement = self._refiner.refine(
+                query, hypothesis.T_scene_cam, near=hypothesis.source == "prior"
+            )
             result = self._result(hypothesis, refinement)
             if result.ok:
                 return _timed(result, timer)

@@ -17,6 +17,8 @@ from igaussian_core.lifting import at_pixels, sample, trusted_depth, unproject
 from igaussian_core.pnp import pose_covariance, solve_pnp
 from igaussian_core.query import Query
 from igaussian_core.refine.alignment import corners, follow
+from igaussian_core.refine.matchers import GuidedKeypoints, PairMatcher, make_pair_matcher
+from igaussian_core.refine.relative import SCALES, solve_relative
 from igaussian_core.refine.verify import Evidence, judge
 from igaussian_core.result import Status
 
@@ -75,21 +77,27 @@ class Refiner:
         verify: VerifyConfig,
     ) -> None:
         self._render = render
-        self._matcher = matcher
-        self._keypoints = keypoints
+        self._matcher = make_pair_matcher(config, matcher, keypoints)
+        self._guided: PairMatcher = self._matcher
+        if config.guided_radius_px > 0 and config.matcher == "auto":
+            self._guided = GuidedKeypoints(matcher, keypoints, config.guided_radius_px)
         self._config = config
         self._verify = verify
 
-    def refine(self, query: Query, T_scene_cam: Array) -> Refinement:
+    def refine(self, query: Query, T_scene_cam: Array, near: bool = False) -> Refinement:
         """The pose near a hypothesis, by alignment where that convinces, else by descriptors.
 
         Alignment costs a fifth of descriptor matching and is the more exact of the two, but
         only finds poses a few degrees away.
+
+        Args:
+            near: the hypothesis comes from the last frame; descriptors are compared only near
+                where the render says the points should be.
         """
         aligned = self.align(query, T_scene_cam)
         if self._status(aligned) is Status.OK:
             return aligned
-        matched = self.match(query, T_scene_cam)
+        matched = self.match(query, T_scene_cam, near)
         if matched.T_scene_cam is None or not self._status(matched).ok:
             return matched
         polished = self.align(query, matched.T_scene_cam)
@@ -122,13 +130,13 @@ class Refiner:
                 break
         return result
 
-    def match(self, query: Query, T_scene_cam: Array) -> Refinement:
+    def match(self, query: Query, T_scene_cam: Array, near: bool = False) -> Refinement:
         """Match descriptors of image and render, PnP; once more where that moved far."""
-        gray = query.gray
+        matcher = self._guided if near else self._matcher
         best: Refinement | None = None
         for _ in range(self._config.rounds):
             view = self._view(query, T_scene_cam)
-            result = self._match_once(query, gray, view, T_scene_cam)
+            result = self._match_once(query, matcher, view, T_scene_cam)
             if best is None or result.evidence.inliers >= 0.8 * best.evidence.inliers:
                 best = result
             if result.T_scene_cam is None or best is not result:
@@ -141,19 +149,16 @@ class Refiner:
         return best
 
     def _match_once(
-        self, query: Query, gray: Gray, view: _View, T_scene_cam: Array
+        self, query: Query, matcher: PairMatcher, view: _View, T_scene_cam: Array
     ) -> Refinement:
-        method = self._matcher.name
+        method = matcher.name
         if view.coverage < _MIN_COVERAGE:
             return Refinement(None, None, Evidence(method, coverage=view.coverage))
-        features = query.features
-        with query.timer("extract"):
-            rendered = self._matcher.extract(view.image, self._keypoints)
-        with query.timer("match"):
-            pairs = self._matcher.match(features, rendered)
+        uv_image, uv_render = matcher.match(query, view.image)
+        gray = query.gray
         with query.timer("align"):
-            pairs = pairs[at_pixels(view.trusted, rendered.uv[pairs[:, 1]])]
-            uv_image, uv_render = features.uv[pairs[:, 0]], rendered.uv[pairs[:, 1]]
+            known = at_pixels(view.trusted, uv_render)
+            uv_image, uv_render = uv_image[known], uv_render[known]
             exact, good = follow(
                 view.gray, gray, uv_render, uv_image, self._config.align_window, levels=0
             )
@@ -161,7 +166,7 @@ class Refiner:
             uv_image = np.where(good[:, None], exact, uv_image)
         with query.timer("solve"):
             return self._solve(
-                query, view, T_scene_cam, method, uv_render, uv_image, looked_at=len(pairs)
+                query, view, T_scene_cam, method, uv_render, uv_image, looked_at=len(uv_image)
             )
 
     def _view(self, query: Query, T_scene_cam: Array) -> _View:
@@ -183,13 +188,19 @@ class Refiner:
         self, query: Query, view: _View, T_scene_cam: Array, method: str,
         uv_render: Pixels, uv_image: Pixels, looked_at: int,
     ) -> Refinement:  # fmt: skip
-        """PnP of the image's pixels with the render's points, and what speaks for it."""
-        camera = query.camera
-        points_cam = unproject(camera, uv_render, sample(view.depth, uv_render))
-        points = transform_points(T_scene_cam, points_cam)
-        solution = solve_pnp(
-            camera, uv_image, points, self._config.max_reprojection_px, T_scene_cam
-        )
+        """The pose that the image's and the render's pixels tell, and what speaks for it."""
+        camera, config = query.camera, self._config
+        depth = sample(view.depth, uv_render)
+        points = transform_points(T_scene_cam, unproject(camera, uv_render, depth))
+        if config.solver == "paper":
+            solution = solve_relative(
+                camera, uv_render, uv_image, depth, T_scene_cam, config.max_sampson_px,
+                config.max_reprojection_px, SCALES[config.scale],
+            )  # fmt: skip
+        else:
+            solution = solve_pnp(
+                camera, uv_image, points, config.max_reprojection_px, T_scene_cam
+            )
         if solution is None:
             return Refinement(None, None, Evidence(method, looked_at, coverage=view.coverage))
         inliers, residuals = solution.inliers, solution.residuals_px[solution.inliers]

@@ -13,7 +13,7 @@ class Evidence:
     """What the last round of refinement saw.
 
     Attributes:
-        method: where the correspondences came from: "align", "xfeat", "sift".
+        method: where the correspondences came from: "align", or the matcher's name.
         matches: correspondences of image and render looked at, with trusted depth.
         inliers: of them, those that agree with the pose.
         residual_px: the inliers' median reprojection error.
@@ -61,6 +61,5 @@ def _thresholds(method: str, config: VerifyConfig) -> tuple[int, float]:
     """Least inliers and inlier ratio of a kind of correspondences."""
     return {
         "align": (config.min_inliers_align, config.min_ratio_align),
-        "xfeat": (config.min_inliers_xfeat, config.min_ratio_xfeat),
         "sift": (config.min_inliers_sift, config.min_ratio_sift),
-    }[method]
+    }.get(method, (config.min_inliers_xfeat, config.min_ratio_xfeat))

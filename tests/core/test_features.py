@@ -203,7 +203,7 @@ def test_incomplete_weights_are_refused(xfeat: XFeatMatcher) -> None:
     state = dict(xfeat._xfeat.net.state_dict())
     state.pop(next(iter(state)))
     with pytest.raises(WeightsError, match="missing"):
-        module._load_strictly(xfeat._xfeat.net, state, "xfeat.pt")
+        module.load_strictly(xfeat._xfeat.net, state, "xfeat.pt")
 
 
 def test_weights_never_run_code() -> None:
