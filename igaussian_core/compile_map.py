@@ -15,6 +15,7 @@ from igaussian_core.camera import Camera
 from igaussian_core.config import Config
 from igaussian_core.errors import MapError
 from igaussian_core.features import Matcher, make_matcher
+from igaussian_core.formats import map_file
 from igaussian_core.gaussian_map import GaussianMap, file_sha256, load_map
 from igaussian_core.geometry import Sim3, inverse, transform_points
 from igaussian_core.lifting import at_pixels, sample, trusted_depth, unproject
@@ -81,14 +82,14 @@ def compile_map(
     """Compile a Gaussian map file into a map directory at `target`.
 
     Args:
-        source: a .ply of Gaussians.
+        source: a file of Gaussians, or a trainer's folder.
         cameras: poses of the training cameras, in any format of `posed_images`; where a
             `map.json` beside the source names the photos trained on, only those are used.
 
     Raises:
         MapError, DatasetError: unusable input; nothing at `target` is touched then.
     """
-    source, options, config = Path(source), options or CompileOptions(), config or Config()
+    source, options, config = map_file(source), options or CompileOptions(), config or Config()
     _check_options(options)
     check_target(target)
     gmap = load_map(source)

@@ -9,7 +9,7 @@ import json
 import struct
 from bisect import bisect_left
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from igaussian_core.camera import Camera
 from igaussian_core.errors import CameraError, DatasetError
 from igaussian_core.geometry import (
+    Sim3,
     compose,
     interpolate_pose,
     inverse,
@@ -133,7 +134,10 @@ def _read(file: Path) -> Iterator[PosedImage]:
     elif "frames" in data and data["frames"] and "T_world_cam" in data["frames"][0]:
         yield from (_poses_frame(file, entry) for entry in data["frames"])
     elif "frames" in data:
-        yield from (_nerf_frame(file, data, entry) for entry in data["frames"])
+        normalize = _nerfstudio_normalization(file, data)
+        for entry in data["frames"]:
+            frame = _nerf_frame(file, data, entry)
+            yield replace(frame, T_scene_cam=normalize.camera(frame.T_scene_cam))
     else:
         raise DatasetError(f"{file}: JSON without 'frames'; supported: {SUPPORTED}")
 
@@ -220,6 +224,25 @@ def _nerf_frame(file: Path, data: dict[str, Any], e: dict[str, Any]) -> PosedIma
     )  # fmt: skip
     T_scene_cam = np.array(e["transform_matrix"], float) @ _OPENCV_FROM_OPENGL
     return PosedImage(e["file_path"], path, camera, T_scene_cam)
+
+
+def _nerfstudio_normalization(file: Path, data: dict[str, Any]) -> Sim3:
+    """From the poses of transforms.json into the frame that nerfstudio trained in.
+
+    `dataparser_transforms.json`, which nerfstudio writes into its output folder, tells where a
+    copy lies beside the poses; identity without. Its transform takes the frame before
+    `applied_transform`, the poses are after it.
+    """
+    note = file.parent / "dataparser_transforms.json"
+    if not note.is_file():
+        return Sim3.identity()
+    saved = json.loads(note.read_text())
+    transform = np.vstack([np.array(saved["transform"], float), [0, 0, 0, 1]])
+    applied = np.vstack([np.array(data.get("applied_transform", np.eye(4)[:3]), float),
+                         [0, 0, 0, 1]])  # fmt: skip
+    scale = float(saved["scale"]) / float(data.get("applied_scale", 1.0))
+    motion = transform @ np.linalg.inv(applied)
+    return Sim3(scale, motion[:3, :3], scale * motion[:3, 3])
 
 
 def _nerf_lens(file: Path, name: str, is_fisheye: bool) -> tuple[str, tuple[str, ...]]:

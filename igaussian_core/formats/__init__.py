@@ -10,37 +10,62 @@ import zipfile
 from pathlib import Path
 
 from igaussian_core.errors import MapError
-from igaussian_core.formats import ply, sog, splat, spz
+from igaussian_core.formats import nerfstudio, ply, sog, splat, spz
 from igaussian_core.formats.raw import RawGaussians
 
-__all__ = ["SUPPORTED", "RawGaussians", "read_gaussians"]
+__all__ = ["SUPPORTED", "RawGaussians", "map_file", "read_gaussians"]
 
 SUPPORTED = (
     ".ply (INRIA's layout, SuperSplat compressed), .splat, .spz (versions 1 to 4), "
-    ".sog (versions 1 and 2; a folder with meta.json or a zip archive)"
+    ".sog (versions 1 and 2; a folder with meta.json or a zip archive), "
+    "folders that INRIA's trainer or nerfstudio's splatfacto wrote"
 )
 
 
 def read_gaussians(path: str | Path) -> RawGaussians:
-    """Read a file, or a .sog folder, of any supported format.
+    """Read a file, or a folder, of any supported format.
 
     Raises:
         MapError: missing, of no supported format, truncated or damaged.
     """
     file = Path(path)
     try:
-        return _read(file)
+        return _read(map_file(file))
     except OSError as error:
         raise MapError(f"{file}: cannot be read: {error.strerror or error}") from error
     except MemoryError as error:
         raise MapError(f"{file}: needs more memory than there is") from error
 
 
+def map_file(path: str | Path) -> Path:
+    """The file that holds a map: the path itself, or the newest one that a trainer left in a
+    folder.
+
+    Raises:
+        MapError: a folder of no known kind.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        return folder
+    if (folder / "meta.json").is_file():
+        return folder / "meta.json"
+    for pattern in (
+        "point_cloud/iteration_*/point_cloud.ply", "nerfstudio_models/step-*.ckpt",
+    ):  # fmt: skip
+        found = sorted(folder.glob(pattern), key=_iteration)
+        if found:
+            return found[-1]
+    raise MapError(f"{folder}: a folder without a map; supported: {SUPPORTED}")
+
+
+def _iteration(file: Path) -> int:
+    """The number in iteration_30000/point_cloud.ply or step-000029999.ckpt."""
+    text = file.parent.name if file.name == "point_cloud.ply" else file.stem
+    digits = "".join(letter for letter in text if letter.isdigit())
+    return int(digits or 0)
+
+
 def _read(file: Path) -> RawGaussians:
-    if file.is_dir():
-        if (file / "meta.json").is_file():
-            return sog.read_folder(file)
-        raise MapError(f"{file}: a folder without meta.json; supported: {SUPPORTED}")
     if not file.is_file():
         raise MapError(f"{file}: no such file")
     with open(file, "rb") as stream:
@@ -49,6 +74,8 @@ def _read(file: Path) -> RawGaussians:
         return ply.read(file)
     if magic == b"NGSP" or magic[:2] == b"\x1f\x8b":
         return spz.read(file)
+    if file.suffix.lower() == ".ckpt":
+        return nerfstudio.read(file)
     if magic == b"PK\x03\x04" and zipfile.is_zipfile(file):
         return sog.read_archive(file)
     if file.name == "meta.json":
