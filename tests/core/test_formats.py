@@ -468,7 +468,7 @@ def test_what_is_not_supported_is_named(
 
 
 def test_folders_that_are_no_map(tmp_path: Path) -> None:
-    with pytest.raises(MapError, match="without a map"):
+    with pytest.raises(MapError, match="without meta.json"):
         load_map(tmp_path)
     with pytest.raises(MapError, match="no such file"):
         load_map(tmp_path / "absent.spz")
