@@ -104,6 +104,7 @@ class Method:
 
 
 CONFIG = Config()
+SOLVER = Config.from_flat({"refine.solver": "paper", "refine.scale": "depth"})
 SIFT = dataclasses.replace(CONFIG, features=dataclasses.replace(CONFIG.features, matcher="sift"))
 
 
@@ -128,7 +129,14 @@ def _descent(start: str) -> Callable[[Case], Estimator]:
 
 DESCENT_COARSE = Method("gradient descent from our stage one", _descent("coarse"), slow=True)
 DESCENT_PRIOR = Method("gradient descent from the prior", _descent("prior"), slow=True)
-PEERS = (OURS, PAPER, SFM, ESSENTIAL_SIFT, ESSENTIAL_XFEAT, DESCENT_COARSE, DESCENT_PRIOR)
+PAPERS_SOLVER = Method(
+    "our stage one, the paper's solver (XFeat, RANSAC), scale by depth",
+    lambda c: Localizer(c.package, SOLVER),
+)
+PEERS = (
+    OURS, PAPER, PAPERS_SOLVER, SFM, ESSENTIAL_SIFT, ESSENTIAL_XFEAT, DESCENT_COARSE,
+    DESCENT_PRIOR,
+)  # fmt: skip
 
 
 def _staged(refine: Callable[..., Any], **settings: Any) -> Callable[[Case], Estimator]:
@@ -142,6 +150,7 @@ ABLATION = (
     Method("paper: network + WPM + ViT", _paper),
     Method("paper: network + WPM + LoFTR and RANSAC", _paper),
     Method("paper: all", _paper),
+    PAPERS_SOLVER,
     Method("ours: landmarks alone (stage one)", lambda c: CoarseOnly(c.package, CONFIG)),
     Method("ours: + matching and PnP, one round",
            _staged(lambda r, q, T: r.match(q, T), rounds=1)),
