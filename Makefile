@@ -8,10 +8,11 @@ NATIVE := $(wildcard igaussian_core/render/native/*.cpp igaussian_core/render/na
 # Fast DDS's default shared memory is too small for camera images
 export FASTRTPS_DEFAULT_PROFILES_FILE ?= $(CURDIR)/msg_configs/fastdds_large_images.xml
 
-.PHONY: help venv demo test lint format clean
+.PHONY: help venv demo eval test lint format clean
 
 help:
 	@echo "make demo     localize the bundled drive through the real ROS 2 node, with a report"
+	@echo "make eval     accuracy in the bundled room by the paper's protocol, with a report"
 	@echo "make test     all tests"
 	@echo "make lint     ruff and mypy"
 	@echo "make venv     only the environment: .venv with CPU torch and ROS 2 Jazzy from PyPI"
@@ -34,6 +35,12 @@ $(BUILT): $(DEPS) $(NATIVE) pyproject.toml
 
 demo: venv
 	$(BIN)/igaussian demo $(ARGS)
+
+eval: venv
+	test -d out/room.igmap || $(BIN)/igaussian map compile bags/demo/room.ply -o out/room.igmap \
+		--cameras bags/demo/mapping_cameras.json
+	$(BIN)/igaussian eval rendered --map out/room.igmap --json out/evaluation.json \
+		--report out/evaluation.html $(ARGS)
 
 test: venv
 	$(BIN)/python -m pytest $(ARGS)
