@@ -61,7 +61,7 @@ def _photos(work: Path) -> list[dict[str, object]]:
     rows = []
     for name, data_set, with_cameras, kind, prefix in CASES:
         folder = data_folder() / "sets" / data_set
-        localizer = Localizer.open(_compiled(work, name, folder, with_cameras, kind))
+        localizer = Localizer.open(compiled(work, name, folder, with_cameras, kind))
         held_out = held_out_images(folder / "poses.json", None)
         images = [image for image in held_out if image.name.startswith(prefix)]
         size = extent(training_images(folder / "map.ply", folder / "poses.json"))
@@ -103,7 +103,7 @@ def _cross_scene(work: Path) -> list[dict[str, object]]:
                ("fox", "flower", "fern", "redkitchen", "lego", "shelf", "desk5")}  # fmt: skip
     for name, data_set, with_cameras, kind, _ in CASES[:5]:
         folder = data_folder() / "sets" / data_set
-        localizer = Localizer.open(_compiled(work, name, folder, with_cameras, kind))
+        localizer = Localizer.open(compiled(work, name, folder, with_cameras, kind))
         others = [image for other, images in queries.items() if other != data_set
                   for image in images]  # fmt: skip
         results = [localizer.localize(image.read(), image.camera) for image in others]
@@ -120,7 +120,7 @@ def _some_photos(name: str, count: int = 15) -> list[PosedImage]:
     return images[:: max(1, len(images) // count)][:count]
 
 
-def _compiled(
+def compiled(
     work: Path, name: str, folder: Path, with_cameras: bool, kind: str | None
 ) -> Path:
     target = work / f"{name.replace(', ', '_').replace(' ', '_')}.igmap"

@@ -113,9 +113,14 @@ class RefineConfig:
     max_depth_step: float = _option(
         0.1, "relative depth change within 2 px above which a pixel is an edge", 0, 1
     )
+    covariance_cell_px: float = _option(
+        32.0, "side of image cells whose matches count as one in the covariance, since "
+        "neighbours share the map's errors; 0: each counts", 0, 1000
+    )  # fmt: skip
     covariance_inflation: float = _option(
-        6.0, "variance factor, since errors of neighbouring matches are not independent", 1, 1000
-    )
+        3.0, "variance factor, since sigma is measured on inliers and errors reach over cells",
+        1, 1000,
+    )  # fmt: skip
     position_floor_rel: float = _option(
         0.0002, "standard deviation of the map's own errors, share of the median depth", 0, 0.1
     )

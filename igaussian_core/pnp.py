@@ -86,7 +86,11 @@ def reprojection_errors(
 
 
 def pose_covariance(
-    camera: Camera, T_scene_cam: Array, points_scene: Array, residuals_px: Array
+    camera: Camera,
+    T_scene_cam: Array,
+    points_scene: Array,
+    residuals_px: Array,
+    cell_px: float = 0.0,
 ) -> Array:
     """Covariance [6, 6] of a pose from its inliers, scene axes, order x y z rx ry rz.
 
@@ -97,6 +101,8 @@ def pose_covariance(
     Args:
         points_scene: inlier points [N, 3], in front of the camera.
         residuals_px: their reprojection errors [N].
+        cell_px: side of image cells whose points count as one, since neighbours share the
+            map's errors; 0: every point counts.
     """
     rotation, position = T_scene_cam[:3, :3], T_scene_cam[:3, 3]
     offsets = np.asarray(points_scene, np.float64) - position
@@ -107,13 +113,24 @@ def pose_covariance(
     ).reshape(-1, 2, 3)
     d_position = np.broadcast_to(-rotation.T, (len(z), 3, 3))
     d_rotation = rotation.T @ skew(offsets)
-    J = (d_pixel @ np.concatenate([d_position, d_rotation], axis=2)).reshape(-1, 6)
+    J = d_pixel @ np.concatenate([d_position, d_rotation], axis=2)
+    if cell_px > 0:
+        uv = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+        J = J * np.sqrt(_share_of_cell(uv, cell_px))[:, None, None]
+    J = J.reshape(-1, 6)
     variance = max(float(np.mean(np.square(residuals_px))) / 2, 0.1**2)
     # units of the translation columns are scaled so that the inverse stays well conditioned
     scale = np.array([1 / np.median(z)] * 3 + [1.0] * 3)
     information = (J / scale).T @ (J / scale) + 1e-9 * np.eye(6)
     covariance = variance * np.linalg.inv(information) / np.outer(scale, scale)
     return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def _share_of_cell(uv: Array, cell_px: float) -> Array:
+    """One over the number of pixels [N, 2] that are in the same cell of a grid."""
+    cells = np.floor(uv / cell_px).astype(np.int64)
+    _, index, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(1.0 / counts[index.ravel()])
 
 
 def _poselib_camera(camera: Camera) -> dict[str, object]:

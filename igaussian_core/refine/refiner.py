@@ -204,7 +204,9 @@ class Refiner:
         if solution is None:
             return Refinement(None, None, Evidence(method, looked_at, coverage=view.coverage))
         inliers, residuals = solution.inliers, solution.residuals_px[solution.inliers]
-        covariance = pose_covariance(camera, solution.T_scene_cam, points[inliers], residuals)
+        covariance = pose_covariance(
+            camera, solution.T_scene_cam, points[inliers], residuals, config.covariance_cell_px
+        )
         depths = transform_points(inverse(solution.T_scene_cam), points[inliers])[:, 2]
         covariance = self._calibrated(covariance, float(np.median(depths)))
         evidence = Evidence(

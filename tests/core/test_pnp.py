@@ -175,3 +175,19 @@ def test_covariance_of_few_or_degenerate_points_is_large_but_finite() -> None:
     covariance = pose_covariance(CAMERA, T_TRUE, points, np.full(4, 1.0))
     assert np.isfinite(covariance).all()
     assert np.linalg.eigvalsh(covariance).max() > 1.0
+
+
+def test_points_of_a_cell_count_as_one() -> None:
+    uv, points = matches(40)
+    residuals = np.full(len(points), 1.0)
+    one = pose_covariance(CAMERA, T_TRUE, points, residuals, cell_px=1.0)
+    assert np.allclose(one, pose_covariance(CAMERA, T_TRUE, points, residuals), rtol=1e-6)
+    # ninety-nine copies of a point say no more than that point
+    crowd = np.concatenate([points, np.repeat(points[:1], 99, axis=0)])
+    crowded = pose_covariance(CAMERA, T_TRUE, crowd, np.full(len(crowd), 1.0), cell_px=1.0)
+    assert np.allclose(crowded, one, rtol=1e-6)
+    # neighbours share a cell: less is known than by counting each
+    coarse = pose_covariance(CAMERA, T_TRUE, points, residuals, cell_px=160.0)
+    assert np.linalg.eigvalsh(coarse - one).min() > -1e-12
+    assert np.trace(coarse) > 1.5 * np.trace(one)
+    assert np.linalg.eigvalsh(coarse).min() > 0

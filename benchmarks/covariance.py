@@ -1,0 +1,130 @@
+"""Is the covariance true? NEES and coverage by data set, for held-out photos and for renders.
+
+Where it is, e^T C^-1 e is 6 on average and 95 % of the errors lie inside the 95 % ellipsoid. Photos
+are those the map was not trained on. Renders come from the map itself, near its training cameras,
+with another brightness and noise: they know nothing of the map's own errors, so a covariance that
+allows for these is too large for them.
+
+    python benchmarks/covariance.py [--work folder] [--renders 20] [--json out.json]
+        [--set refine.covariance_inflation=4 ...]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from _data import data_folder
+from numpy.typing import NDArray
+from photos import CASES, compiled
+
+from igaussian_core.camera import Camera
+from igaussian_core.cli_tools import load_config
+from igaussian_core.compile_map import training_images
+from igaussian_core.evaluate.metrics import QueryOutcome, plain, summarize
+from igaussian_core.evaluate.photos import PhotoQueries, extent, held_out_images
+from igaussian_core.evaluate.runner import run
+from igaussian_core.geometry import compose, rotation_from_vector
+from igaussian_core.localizer import Localizer
+from igaussian_core.posed_images import PosedImage
+from igaussian_core.refine.refiner import to_u8
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RenderQueries:
+    """Renders of a map at known poses, brightness and noise by their number."""
+
+    localizer: Localizer
+    views: tuple[tuple[Camera, Array], ...]
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def name(self, index: int) -> str:
+        return f"render {index}"
+
+    def group(self, index: int) -> str:
+        return ""
+
+    def image(self, index: int) -> tuple[NDArray[np.uint8], Camera]:
+        camera, T_map_cam = self.views[index]
+        rgb, _, _ = self.localizer.render(camera, T_map_cam)
+        rng = np.random.default_rng(index)
+        noise = rng.normal(0, 0.012, rgb.shape)
+        return to_u8((rgb * rng.uniform(0.8, 1.2) + noise).astype(np.float32)), camera
+
+    def prior(self, index: int) -> Array | None:
+        return None
+
+    def truth(self, index: int) -> Array:
+        return self.views[index][1]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--work", type=Path)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--renders", type=int, default=20)
+    parser.add_argument("--set", action="append", default=[], help="configuration, e.g. a.b=1")
+    arguments = parser.parse_args()
+    config = load_config(None, arguments.set)
+    report, pooled = {}, {"photos": [], "renders": []}
+    print("| set | poses | mean NEES | median NEES | inside the 95 % ellipsoid |")
+    print("|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as temporary:
+        for name, data_set, with_cameras, kind, prefix in CASES[:5]:
+            folder = data_folder() / "sets" / data_set
+            package = compiled(
+                arguments.work or Path(temporary), name, folder, with_cameras, kind
+            )
+            localizer = Localizer.open(package, config)
+            size = extent(training_images(folder / "map.ply", folder / "poses.json"))
+            photos = [i for i in held_out_images(folder / "poses.json", None)
+                      if i.name.startswith(prefix)]  # fmt: skip
+            red, green, blue = localizer.manifest.background
+            tracks = {
+                "photos": PhotoQueries(tuple(photos), localizer.T_map_scene, (red, green, blue)),
+                "renders": RenderQueries(localizer, _views(localizer, folder, size, arguments)),
+            }
+            for track, queries in tracks.items():
+                outcomes = run(lambda localizer=localizer: localizer, queries).outcomes
+                pooled[track] += outcomes
+                report[f"{name}, {track}"] = _row(f"{name}, {track}", outcomes, 0.05 * size)
+    for track, outcomes in pooled.items():
+        report[f"all {track}"] = _row(f"all {track}", outcomes, float("inf"))
+    if arguments.json:
+        arguments.json.write_text(json.dumps(report, indent=1))
+
+
+def _views(
+    localizer: Localizer, folder: Path, size: float, arguments: argparse.Namespace
+) -> tuple[tuple[Camera, Array], ...]:
+    """Cameras 3 degrees and 3 % of the extent (one sigma an axis) off those of training photos."""
+    rng = np.random.default_rng(0)
+    photos: list[PosedImage] = training_images(folder / "map.ply", folder / "poses.json")
+    views = []
+    for index in rng.integers(len(photos), size=arguments.renders):
+        off = compose(
+            rotation_from_vector(rng.normal(0, np.radians(3), 3)), rng.normal(0, 0.03 * size, 3)
+        )
+        T_scene_cam = photos[index].T_scene_cam @ off
+        camera = photos[index].camera.scaled_to_fit(640).undistorted()
+        views.append((camera, localizer.T_map_scene.camera(T_scene_cam)))
+    return tuple(views)
+
+
+def _row(name: str, outcomes: list[QueryOutcome], max_distance: float) -> dict[str, object]:
+    s = summarize(outcomes, 5.0, max_distance)
+    print(f"| {name} | {s['accepted']:.0f} | {s['mean_nees']:.1f} | {s['median_nees']:.1f} "
+          f"| {s['inside_95']:.1%} |", flush=True)  # fmt: skip
+    return dict(plain(s))
+
+
+if __name__ == "__main__":
+    main()
