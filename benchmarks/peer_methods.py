@@ -339,14 +339,15 @@ def _poselib_camera(camera: Camera) -> dict[str, object]:
 class GradientDescent:
     """Adam on the six numbers of a pose against the photometric error of a differentiable
     render, coarse to fine, as iNeRF and iComMa do (the latter with a matching term on top);
-    started at the prior, or at our landmarks' hypothesis where there is none.
+    started at the prior, or at our landmarks' hypothesis. Unlike theirs it fits gain and offset
+    of each colour channel at every step, without which the paper's colour changes defeat it.
 
     The best of the poses by the error at the finer resolution is the answer: there is no
     evidence by which it could be refused.
     """
 
-    _SIDES = (120, 240)  # longer image side, coarse then fine
-    _RATE = 0.02  # radians, and shares of the median depth; falls to a twentieth
+    # longer image side; step in radians and in shares of the median depth, falls to a twentieth
+    _LEVELS = ((120, 0.02), (240, 0.005))
 
     def __init__(self, package: MapPackage, config: Config, start: str, steps: int) -> None:
         self._steps = steps
@@ -371,19 +372,21 @@ class GradientDescent:
         image, camera = shrunk(image, camera, self._config)
         if T is not None:
             with timer("descend"):
-                for side in self._SIDES:
-                    T = self._descended(image, camera.scaled_to_fit(side), T)
+                for side, rate in self._LEVELS:
+                    T = self._descended(image, camera.scaled_to_fit(side), T, rate)
         return _answer(self._package, T, 0, timer, self._start)
 
-    def _descended(self, image: Image, camera: Camera, T_scene_cam: Array) -> Array:
-        steps = self._steps // len(self._SIDES)
+    def _descended(
+        self, image: Image, camera: Camera, T_scene_cam: Array, rate: float
+    ) -> Array:
+        steps = self._steps // len(self._LEVELS)
         size = (camera.width, camera.height)
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         wanted = torch.from_numpy(small.astype(np.float32) / 255)
         T_start = torch.from_numpy(inverse(T_scene_cam))
         length = self._depth(camera, T_scene_cam)
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-        adam = torch.optim.Adam([twist], lr=self._RATE)
+        adam = torch.optim.Adam([twist], lr=rate)
         fall = torch.optim.lr_scheduler.ExponentialLR(adam, 0.05 ** (1 / steps))
         red, green, blue = self._package.manifest.background
         best, best_T = np.inf, T_start
@@ -393,7 +396,7 @@ class GradientDescent:
                 *self._map, camera, T, background=(red, green, blue),
                 antialiased=self._package.gaussians.antialiased,
             )  # fmt: skip
-            loss = (rgb - wanted).abs().mean()
+            loss = (_exposed(rgb, wanted) - wanted).abs().mean()
             if loss.item() < best:
                 best, best_T = loss.item(), T.detach()
             adam.zero_grad()
@@ -408,6 +411,16 @@ class GradientDescent:
         )
         seen = depth[alpha > 0.5]
         return float(np.median(seen)) if len(seen) else 1.0
+
+
+def _exposed(rgb: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
+    """A render [H, W, 3] with the gain and offset of each channel that bring it nearest."""
+    with torch.no_grad():
+        centred = rgb - rgb.mean((0, 1))
+        gain = (centred * (wanted - wanted.mean((0, 1)))).sum((0, 1))
+        gain = (gain / centred.square().sum((0, 1)).clamp(min=1e-9)).clamp(0.2, 5)
+        offset = wanted.mean((0, 1)) - gain * rgb.mean((0, 1))
+    return gain * rgb + offset
 
 
 def _exponential(twist: torch.Tensor, length: float) -> torch.Tensor:
