@@ -31,6 +31,7 @@ OUTPUTS = ("rgb", "depth", "alpha", "median_depth", "ids")
 # 3DGS cuts at 0.2 of a unit, which is 20 cm in a metric map: a robot stands closer to things
 DEFAULT_NEAR = 0.01
 MAX_SIDE = 1 << 15
+MAX_GAUSSIANS = 1 << 24  # scene.h: kSplatBits
 _CACHE_LINE = 64
 
 
@@ -101,7 +102,8 @@ class Rasterizer:
         simd: instruction set, one of available_simd(); None: IGAUSSIAN_SIMD or the fastest.
 
     Raises:
-        MapError: shapes that do not fit, values that are not finite, opacities outside [0, 1].
+        MapError: shapes that do not fit, values that are not finite, opacities outside [0, 1],
+            more than 2^24 Gaussians.
         IGaussianError: the instruction set is not available, the library is not built.
     """
 
@@ -152,7 +154,7 @@ class Rasterizer:
 
         Raises:
             CameraError: the camera has distortion (use camera.undistorted()), the image is larger
-                than 32768 pixels a side, or T_cam_scene is not a rigid transform.
+                than 32768 pixels a side, near is not positive, or T_cam_scene is not rigid.
         """
         frame = _frame(camera, T_cam_scene, background, near, threads)
         images = _allocate(camera, outputs)
@@ -285,6 +287,8 @@ def _frame(
     threads: int | None,
 ) -> native.Frame:
     check_camera(camera)
+    if not near > 0:
+        raise CameraError(f"renderer: near is {near:g}, must be positive")
     return native.Frame(
         width=camera.width,
         height=camera.height,
@@ -308,6 +312,8 @@ def _checked(*arrays: ArrayLike) -> list[NDArray[np.float32]]:
     names = ("means", "quats_wxyz", "scales", "opacities", "sh")
     result = [np.ascontiguousarray(array, np.float32) for array in arrays]
     count = len(result[0]) if result[0].ndim else 0
+    if count > MAX_GAUSSIANS:
+        raise MapError(f"renderer: {count} Gaussians; at most {MAX_GAUSSIANS} are supported")
     shapes: list[tuple[int, ...]] = [(count, 3), (count, 4), (count, 3), (count,)]
     for name, array, shape in zip(names, result, shapes, strict=False):
         if array.shape != shape:

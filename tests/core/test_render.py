@@ -108,6 +108,27 @@ def test_the_pixel_at_the_principal_point_sees_the_full_opacity(simd: str) -> No
     assert render.alpha[0, 0] == render.depth[0, 0] == 0
 
 
+@EVERY_SIMD
+@pytest.mark.parametrize("side", [1, -1])
+def test_depths_that_float32_cannot_tell_apart_are_sorted(simd: str, side: int) -> None:
+    x = 1e-7 * side
+    first, second = one_gaussian((0, 0, 3), 0.2), one_gaussian((x, 0, 3), 0.2)
+    gaussians = tuple(np.concatenate(pair) for pair in zip(first, second, strict=True))
+    gaussians[4][1] = -1.0  # dark
+    T = np.eye(4)
+    angle = 0.05
+    T[:3, :3] = [
+        [np.cos(angle), 0, np.sin(angle)],
+        [0, 1, 0],
+        [-np.sin(angle), 0, np.cos(angle)],
+    ]
+    depths = gaussians[0].astype(np.float64) @ T[2, :3]
+    assert np.float32(depths[0]) == np.float32(depths[1]) and depths[0] != depths[1]
+    truth = oracle(gaussians, CAMERA, T)  # type: ignore[arg-type]
+    render = Rasterizer(*gaussians, simd=simd).render(CAMERA, T)
+    assert np.abs(render.rgb - truth.rgb).max() < 1e-3
+
+
 def test_the_result_does_not_depend_on_threads_nor_on_the_frame_before() -> None:
     rasterizer = Rasterizer(*random_gaussians(1))
     first = rasterizer.render(CAMERA, some_pose(), threads=1, outputs=ALL_OUTPUTS)
@@ -141,12 +162,18 @@ def test_a_distorted_camera_is_refused() -> None:
         Rasterizer(*random_gaussians(0, 10)).render(camera, np.eye(4))
 
 
+def test_a_near_plane_behind_the_camera_is_refused() -> None:
+    with pytest.raises(CameraError, match="near is 0"):
+        Rasterizer(*random_gaussians(0, 10)).render(CAMERA, np.eye(4), near=0.0)
+
+
 @pytest.mark.parametrize(
     "T", [np.eye(3), np.diag([2.0, 2, 2, 1]), np.diag([-1.0, 1, 1, 1]), np.full((4, 4), np.nan)]
 )
 def test_a_transform_that_is_not_rigid_is_refused(T: np.ndarray) -> None:
-    with pytest.raises(CameraError, match="T_cam_scene"):
+    with pytest.raises(CameraError, match="T_cam_scene") as caught:
         Rasterizer(*random_gaussians(0, 10)).render(CAMERA, T)
+    assert "\n" not in str(caught.value)
 
 
 def test_arrays_that_do_not_fit_are_refused() -> None:

@@ -88,6 +88,7 @@ inline void file(Bins* bins, int tile, uint64_t key) {
 // W projected Gaussians.
 struct alignas(64) Projected {
   float lines[W][16];                  // Splats, but for the index
+  double depth[W];
   int32_t x0[W], x1[W], y0[W], y1[W];  // tiles touched, inclusive
   unsigned visible;
 };
@@ -185,6 +186,10 @@ inline void project_lanes(const Model& model, const View& view, const Bins& bins
                         zero,
                         zero};
   to_lines(fields, out->lines[0]);
+  for (int l = 0; l < W; ++l) {
+    out->depth[l] = view.forward[0] * mean[l] + view.forward[1] * mean[kBlock + l] +
+                    (view.forward[2] * mean[2 * kBlock + l] + view.forward[3]);
+  }
   const F per_tile = splat(1.0f / kTile);
   store_int(out->x0, larger(left, zero) * per_tile);
   store_int(out->y0, larger(top, zero) * per_tile);
@@ -206,9 +211,7 @@ void project(const Model& model, const View& view, int64_t super_block, Splat* s
         Splat* s = splats + count;
         std::memcpy(static_cast<void*>(s), lanes.lines[l], sizeof(Splat));
         s->index = model.index[block * kBlock + lane + l];
-        uint32_t depth;
-        std::memcpy(&depth, &s->z, 4);
-        const uint64_t key = static_cast<uint64_t>(depth) << 32 | (first_splat + count);
+        const uint64_t key = make_key(lanes.depth[l], first_splat + count);
         ++count;
         for (int y = lanes.y0[l]; y <= lanes.y1[l]; ++y) {
           for (int x = lanes.x0[l]; x <= lanes.x1[l]; ++x) {
@@ -442,9 +445,9 @@ inline int stage(const Splat* splats, const uint64_t* keys, int64_t left, int si
   const int padded = (size + 15) / 16 * 16;
   for (int i = 0; i < size; ++i) {
     if (i + kAhead < left) {
-      __builtin_prefetch(&splats[static_cast<uint32_t>(keys[i + kAhead])]);
+      __builtin_prefetch(&splats[splat_of(keys[i + kAhead])]);
     }
-    batch->splats[i] = splats[static_cast<uint32_t>(keys[i])];
+    batch->splats[i] = splats[splat_of(keys[i])];
   }
   for (int i = size; i < padded; ++i) batch->splats[i] = batch->splats[kBatch];
   for (int i = 0; i < padded; i += W) cells_touched(batch, i, tile_u, tile_v);
@@ -751,7 +754,7 @@ void blend_backward(const View& view, const Splat* splats, const uint64_t* keys,
     }
     for (int i = 0; i < size; ++i) {
       gradients[start + i] =
-          gather_sums(splats[static_cast<uint32_t>(keys[start + i])], sums.sum[i]);
+          gather_sums(splats[splat_of(keys[start + i])], sums.sum[i]);
     }
   }
 }

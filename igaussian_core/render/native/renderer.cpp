@@ -71,6 +71,7 @@ View make_view(const Frame& f) {
   v.fx = f.fx, v.fy = f.fy, v.cx = f.cx, v.cy = f.cy;
   v.near_plane = f.near_plane;
   const double* T = f.T_cam_scene;
+  std::copy(T + 8, T + 12, v.forward);
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) v.R[i * 3 + j] = static_cast<float>(T[i * 4 + j]);
     v.t[i] = static_cast<float>(T[i * 4 + 3]);
@@ -137,8 +138,6 @@ void cull(const Model& model, const View& view, std::vector<int32_t>* seen) {
   }
 }
 
-uint32_t depth_bits(uint64_t key) { return static_cast<uint32_t>(key >> 32); }
-
 void counts_to_starts(uint32_t* counts) {
   uint32_t sum = 0;
   for (int i = 0; i < 256; ++i) {
@@ -169,14 +168,16 @@ void sort_keys(uint64_t* keys, uint64_t* spare, size_t n) {
     std::sort(keys, keys + n);
     return;
   }
-  uint32_t least = ~0u, most = 0;
+  uint64_t least = ~uint64_t(0), most = 0;
   for (size_t i = 0; i < n; ++i) {
-    least = std::min(least, depth_bits(keys[i]));
-    most = std::max(most, depth_bits(keys[i]));
+    least = std::min(least, depth_of(keys[i]));
+    most = std::max(most, depth_of(keys[i]));
   }
   int shift = 0;
   while ((most - least) >> shift >> 16) ++shift;
-  const auto digits = [&](uint64_t key) { return (depth_bits(key) - least) >> shift; };
+  const auto digits = [&](uint64_t key) {
+    return static_cast<uint32_t>((depth_of(key) - least) >> shift);
+  };
   uint32_t low[256] = {}, high[256] = {};
   for (size_t i = 0; i < n; ++i) {
     const uint32_t d = digits(keys[i]);
@@ -298,7 +299,7 @@ void Renderer::gather_keys(int tile, uint64_t* keys) {
       const int64_t size = keys_in(list, c);
       for (int64_t i = 0; i < size; ++i) {
         *keys++ = c->keys[i];
-        __builtin_prefetch(&splats[static_cast<uint32_t>(c->keys[i])]);
+        __builtin_prefetch(&splats[splat_of(c->keys[i])]);
       }
     }
   }
@@ -405,7 +406,7 @@ void Renderer::blend_backward(int thread, const View& view, const Images& images
     gather_keys(tile, keys);
     sort_keys(keys, spare, n);
     for (size_t i = 0; i < n; ++i) {
-      entry_splats_.data()[start + i] = static_cast<uint32_t>(keys[i]);
+      entry_splats_.data()[start + i] = splat_of(keys[i]);
     }
     kernel_.blend_backward(view, splats_.data(), keys, static_cast<int64_t>(n), tile % tiles_x_,
                            tile / tiles_x_, images, gradients, entry_gradients_.data() + start);

@@ -22,6 +22,6 @@ struct Frame {
 
 class Renderer;
 
-enum Status { kOk = 0, kOutOfMemory = 1, kNotSupported = 2 };
+enum Status { kOk = 0, kOutOfMemory = 1 };
 
 }  // namespace igaussian

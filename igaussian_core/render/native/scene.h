@@ -70,6 +70,7 @@ struct View {
   float R[9], t[3];      // x_cam = R x_scene + t
   float centre[3];       // camera centre in the scene
   float near_plane;
+  double forward[4];     // z = forward . (x, y, z, 1) of a scene point
   float x_limit[2], y_limit[2];  // clamp of x/z and y/z in the Jacobian
 };
 
@@ -95,9 +96,22 @@ struct SplatGradient {
   float rgb[3], z;
 };
 
+// What a tile's Gaussians are sorted by: 40 bits of depth above 24 bits of splat number. Depths
+// of a large map are closer to each other than float32 can tell, hence 32 bits of mantissa.
+constexpr int kSplatBits = 24;
+static inline uint64_t make_key(double depth, uint32_t splat) {
+  constexpr double kLeast = 1.1754943508222875e-38;  // 2^-126: eight bits of exponent are kept
+  if (!(depth > kLeast)) depth = kLeast;
+  uint64_t bits;
+  __builtin_memcpy(&bits, &depth, sizeof(bits));
+  return ((bits - (uint64_t(1023 - 127) << 52)) >> 20) << kSplatBits | splat;
+}
+static inline uint64_t depth_of(uint64_t key) { return key >> kSplatBits; }
+static inline uint32_t splat_of(uint64_t key) { return key & ((1u << kSplatBits) - 1); }
+
 struct Chunk {
   static constexpr int kKeys = 63;
-  uint64_t keys[kKeys];  // depth bits << 32 | splat number
+  uint64_t keys[kKeys];
   Chunk* next;
 };
 static_assert(sizeof(Chunk) == 512, "eight cache lines");
