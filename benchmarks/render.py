@@ -202,7 +202,12 @@ def run_batch(arrays: Arrays, T: np.ndarray, repeats: int) -> dict[str, Any]:
     poses[:, 0, 3] += np.linspace(-0.3, 0.3, 64)
     loop = timed(lambda: [rasterizer.render(camera, P, threads=2) for P in poses], repeats)
     batch = timed(lambda: rasterizer.render_batch(camera, poses, threads=2), repeats)
-    return {"views": 64, "one_by_one_wall_ms": loop["wall_ms"], "batch_wall_ms": batch["wall_ms"]}
+    return {
+        "views": 64,
+        "one_by_one_wall_ms": loop["wall_ms"],
+        "batch_wall_ms": batch["wall_ms"],
+        "batch_cpu_ms": batch["cpu_ms"],
+    }
 
 
 # --- against the oracle ---
