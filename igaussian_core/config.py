@@ -118,7 +118,7 @@ class RefineConfig:
         "neighbours share the map's errors; 0: each counts", 0, 1000
     )  # fmt: skip
     covariance_inflation: float = _option(
-        3.0, "variance factor, since sigma is measured on inliers and errors reach over cells",
+        4.0, "variance factor, since sigma is measured on inliers and errors reach over cells",
         1, 1000,
     )  # fmt: skip
     position_floor_rel: float = _option(
@@ -139,7 +139,7 @@ class VerifyConfig:
     min_ratio_xfeat: float = _option(0.35, "least inlier ratio with XFeat + LighterGlue", 0, 1)
     min_inliers_sift: int = _option(25, "least PnP inliers with SIFT", 4, 1000)
     min_ratio_sift: float = _option(0.25, "least inlier ratio with SIFT", 0, 1)
-    max_residual_px: float = _option(2.0, "largest median reprojection error of inliers", 0.1, 16)
+    max_residual_px: float = _option(1.25, "largest median reprojection error of inliers", 0.1, 16)
     min_coverage: float = _option(
         0.05, "least share of the render's pixels that the map covers (alpha)", 0, 1
     )
