@@ -98,6 +98,7 @@ def machine_facts() -> dict[str, str]:
     facts = {
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d"),
         "machine": f"{_processor()}, {_cores()} cores",
+        "load": f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown",
         "Python": platform.python_version(),
         "igaussian": __version__,
     }
