@@ -9,7 +9,6 @@ then corrected a few times so that the blend of overlapping Gaussians gives the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,12 +28,15 @@ CORRECTIONS = 5
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Means [N, 3] metres, rotations wxyz [N, 4], scales [N, 3] metres, colours [N, 3] 0..1."""
+    """Means [N, 3] metres, rotations wxyz [N, 4], scales [N, 3] metres, colours [N, 3] 0..1,
+    opacities [N] 0..1.
+    """
 
     means: Array
     quats_wxyz: Array
     scales: Array
     colours: Array
+    opacities: Array
 
     def __len__(self) -> int:
         return len(self.means)
@@ -182,15 +184,15 @@ def _sigma(cell: Ints) -> Array:
     return np.asarray(cell * (SIGMA_FINE + (SIGMA_COARSE - SIGMA_FINE) * share))
 
 
-def _lay(cells: SurfaceCells, chosen: Ints) -> tuple[Array, Array, Array, Array]:
-    """Means, rotations, scales and colours of one surface's Gaussians."""
+def _lay(cells: SurfaceCells, chosen: Ints) -> tuple[Array, Array, Array, Array, Array]:
+    """Means, rotations, scales, colours and opacities of one surface's Gaussians."""
     r, c, h, w = chosen.T
     surface, pitch = cells.surface, cells.pitch
     means = surface.points((c + w / 2) / cells.cols, (r + h / 2) / cells.rows)
     flat = np.full(len(r), THICKNESS)
     scales = np.stack([_sigma(w) * pitch[1], _sigma(h) * pitch[0], flat], 1)
     quats = np.tile(quaternion(_axes(surface)), (len(r), 1))
-    return means, quats, scales, _corrected(cells, chosen)
+    return means, quats, scales, _corrected(cells, chosen), np.full(len(r), OPACITY)
 
 
 def _axes(surface: Surface) -> Array:
@@ -277,12 +279,11 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
     last bit of an exp or log does not matter.
     """
     count = len(gaussians)
-    logit = np.full(count, round(float(np.log(OPACITY / (1 - OPACITY))), 4))
     table = np.column_stack(
         [
             np.round(gaussians.means, 5),
             np.round((gaussians.colours - 0.5) / SH_C0, 4),
-            logit,
+            np.round(np.log(gaussians.opacities / (1 - gaussians.opacities)), 4),
             np.round(np.log(gaussians.scales), 4),
             np.round(gaussians.quats_wxyz, 6),
         ]
@@ -292,6 +293,13 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
     return "\n".join(header).encode("ascii") + table.astype("<f4").tobytes()
 
 
-def write_ply(gaussians: Gaussians, path: Path) -> None:
-    """Write ply_bytes() to path."""
-    path.write_bytes(ply_bytes(gaussians))
+def parse_ply(data: bytes) -> Gaussians:
+    """The Gaussians of a file that ply_bytes() wrote."""
+    header, _, body = data.partition(b"end_header\n")
+    if not header.startswith(b"ply\n") or len(body) % (4 * len(PLY_FIELDS)):
+        raise ValueError("not a .ply file of this script")
+    table = np.frombuffer(body, "<f4").reshape(-1, len(PLY_FIELDS)).astype(np.float64)
+    means, colours, logits, scales, quats = np.split(table, [3, 6, 7, 10], 1)
+    return Gaussians(
+        means, quats, np.exp(scales), colours * SH_C0 + 0.5, 1 / (1 + np.exp(-logits[:, 0]))
+    )

@@ -7,6 +7,7 @@ Each surface is a rectangle c + s u + t v. A camera ray through (x, y, 1) meets 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -45,9 +46,9 @@ class RayCaster:
         """Colour uint8 [H, W, 3] and depth along the optical axis, metres [H, W] (0: nothing)."""
         k, s, t, who = self._visible(rays, T_map_cam)
         colour = np.zeros((*k.shape, 3), np.uint8)
-        for index in np.unique(who[who >= 0]):
-            hit = np.nonzero(who == index)
-            colour[hit] = self._sample(int(index), s[hit], t[hit], k[hit], rays, T_map_cam)
+        for index, pixels in _grouped(who):
+            hit = np.unravel_index(pixels, who.shape)
+            colour[hit] = self._sample(index, s[hit], t[hit], k[hit], rays, T_map_cam)
         depth = np.where(who >= 0, 1 / np.maximum(k, 1e-9), 0).astype(np.float32)
         return colour, depth
 
@@ -92,6 +93,15 @@ class RayCaster:
             rows, cols = texture.shape[:2]
             result[pick] = _remap(texture, s[pick] * cols - 0.5, t[pick] * rows - 0.5)
         return result
+
+
+def _grouped(who: NDArray[np.int16]) -> Iterator[tuple[int, NDArray[np.intp]]]:
+    """Each surface that is seen with its pixels' flat indices in ascending order."""
+    order = np.argsort(who, axis=None, kind="stable")
+    found, first = np.unique(who.ravel()[order], return_index=True)
+    for index, pixels in zip(found.tolist(), np.split(order, first[1:]), strict=True):
+        if index >= 0:
+            yield index, pixels
 
 
 def _pyramid(texture: Image) -> list[Image]:

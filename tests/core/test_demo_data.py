@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,9 @@ import make_demo  # noqa: E402
 
 from demo_room import drive as demo_drive  # noqa: E402
 from demo_room import sensor  # noqa: E402
+from demo_room.compare import as_map, broken_rules, likeness  # noqa: E402
+from demo_room.fit import View, fit, fitting_poses, mapping_camera, take_view  # noqa: E402
+from demo_room.gaussians import Gaussians, parse_ply, ply_bytes  # noqa: E402
 from demo_room.raycast import RayCaster, Rays  # noqa: E402
 from demo_room.surfaces import Room  # noqa: E402
 
@@ -278,7 +282,8 @@ def test_map_renders_like_the_photos(
         rendered = np.clip(rgb * 255, 0, 255)
         assert psnr(rendered, camera.undistort(clean)[0]) > 24
         assert correlation(rendered, photo) > 0.93
-        assert float(np.quantile(alpha, 0.01)) > 0.9, "holes in the map"
+        # fitting thins corners a little; a hole would be far below
+        assert float(np.quantile(alpha, 0.01)) > 0.8, "holes in the map"
         # a gap remains: the map was not made from these photos, nor they from it
         assert psnr(fitted(rendered, photo.astype(float)), photo) < 40
 
@@ -317,8 +322,72 @@ def test_mapping_cameras_stand_in_the_free_room(
 
 
 # ---------------------------------------------------------------- remaking
-def test_script_makes_the_same_map(room: Room) -> None:
-    assert make_demo.map_bytes(room) == (DEMO / "room.ply").read_bytes()
+@pytest.fixture(scope="module")
+def laid(room: Room) -> Gaussians:
+    """The map before fitting, as its file holds it."""
+    return parse_ply(ply_bytes(make_demo.lay_map(room)))
+
+
+@pytest.fixture(scope="module")
+def stored() -> Gaussians:
+    return parse_ply((DEMO / "room.ply").read_bytes())
+
+
+def test_script_lays_the_map_that_the_stored_one_was_fitted_from(
+    laid: Gaussians, stored: Gaussians
+) -> None:
+    """The whole fit takes minutes: `make_demo.py --check` repeats it."""
+    assert broken_rules(stored, laid) == []
+    assert likeness(stored, laid) < make_demo.LIKENESS, "any map would pass --check"
+
+
+@pytest.mark.parametrize(
+    ("name", "changed"),
+    [
+        ("rotations", {"quats_wxyz": (3, 1e-6)}),
+        ("thickness", {"scales": ((3, 2), 1e-7)}),
+        ("sizes", {"scales": ((3, 0), 0.05)}),
+        ("places", {"means": (3, 0.05)}),
+        ("opacities", {"opacities": (3, 0.9999)}),
+        ("colours", {"colours": (3, 1.01)}),
+    ],
+)
+def test_a_map_of_another_origin_is_noticed(
+    name: str, changed: dict[str, Any], laid: Gaussians
+) -> None:
+    ((field, (index, value)),) = changed.items()
+    values = getattr(laid, field).copy()
+    values[index] = value if field in ("opacities", "colours") else values[index] + value
+    assert broken_rules(dataclasses.replace(laid, **{field: values}), laid) == [name]
+
+
+def test_a_map_of_another_size_is_noticed(laid: Gaussians) -> None:
+    fewer = Gaussians(*(getattr(laid, f.name)[1:] for f in dataclasses.fields(laid)))
+    assert broken_rules(fewer, laid) == ["number"]
+
+
+def errors(gaussians: Gaussians, views: list[View]) -> tuple[float, float]:
+    """Mean absolute error of colour (0..1), mean over views of the median relative depth error."""
+    colour, depth = [], []
+    for view in views:
+        rgb, z, _ = as_map(gaussians).render(view.camera, view.T_cam_map)
+        colour.append(np.abs(rgb - view.colour / 255).mean())
+        depth.append(np.median(np.abs(z / view.depth - 1)))
+    return float(np.mean(colour)), float(np.mean(depth))
+
+
+def test_fitting_brings_the_map_closer_to_the_room(room: Room, laid: Gaussians) -> None:
+    """A short fit to a few small views; the same bytes each time."""
+    camera = mapping_camera().resized(160, 120)
+    poses = fitting_poses(room, extra=2)
+    views = [take_view(RayCaster(room), camera, T) for T in (poses[0], poses[40], *poses[-2:])]
+    first, again = (fit(laid, room, views, steps=24) for _ in range(2))
+    assert ply_bytes(first) == ply_bytes(again)
+    changed = parse_ply(ply_bytes(first))
+    assert broken_rules(changed, laid) == []
+    before, after = errors(laid, views), errors(changed, views)
+    assert after[0] < 0.7 * before[0]
+    assert after[1] < 0.95 * before[1]
 
 
 def test_script_makes_the_same_pictures(
