@@ -118,7 +118,8 @@ def test_without_ros(corner, tmp_path: Path) -> None:
     )
     assert "without ROS (asked for)" in output
     assert figures["sent"] == 20 or figures["sent"] == 21
-    assert 1 <= figures["accepted"] <= figures["processed"] <= figures["sent"]
+    # two seconds from the first image on, not from the first message: one image more may fit
+    assert 1 <= figures["accepted"] <= figures["processed"] <= figures["sent"] + 1
     assert figures["max_error_m"] < 0.10
 
 
