@@ -24,7 +24,7 @@ from demo_room.raycast import RayCaster  # noqa: E402
 from demo_room.recording import read_jpegs  # noqa: E402
 from demo_room.room import build_room  # noqa: E402
 from demo_room.surfaces import Array, Image  # noqa: E402
-from igaussian_core import Camera, load_map  # noqa: E402
+from igaussian_core import Camera, GaussianMap, load_map  # noqa: E402
 
 SHOWN = (5, 95, 135, 185)
 PIXELS_PER_METRE = 140
@@ -38,10 +38,9 @@ def demo_camera() -> Camera:
     )
 
 
-def comparison() -> Image:
+def comparison(gmap: GaussianMap) -> Image:
     """Rows of undistorted photo, rendering at the true pose, rendered depth."""
-    camera = demo_camera()
-    gmap, drive = load_map(HERE / "demo" / "room.ply"), Drive()
+    camera, drive = demo_camera(), Drive()
     recorded, rows = read_jpegs(HERE / "demo" / "drive"), []
     for index in SHOWN:
         bgr = cv2.imdecode(np.frombuffer(recorded[index], np.uint8), cv2.IMREAD_COLOR)
@@ -54,11 +53,11 @@ def comparison() -> Image:
     return np.vstack(rows)
 
 
-def print_psnr() -> None:
+def print_psnr(gmap: GaussianMap) -> None:
     """PSNR of the map's renderings against ray-cast images, once a second of the drive."""
     room = build_room()
     bake(room)
-    camera, gmap, drive = demo_camera(), load_map(HERE / "demo" / "room.ply"), Drive()
+    camera, drive = demo_camera(), Drive()
     model, values = sensor.CameraModel(RayCaster(room), drive), []
     for time in image_times()[::10]:
         clean, pinhole = camera.undistort(np.rint(model.clean(float(time))).astype(np.uint8))
@@ -103,13 +102,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Pictures of the bundled demo.")
     parser.add_argument("--out", type=Path, required=True, help="folder to write into")
     parser.add_argument("--psnr", action="store_true", help="print the map's PSNR")
+    parser.add_argument("--map", type=Path, default=HERE / "demo" / "room.ply", help="another map")
     options = parser.parse_args()
-    folder = options.out
+    folder, gmap = options.out, load_map(options.map)
     folder.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(folder / "demo.jpg"), comparison(), [cv2.IMWRITE_JPEG_QUALITY, 88])
+    cv2.imwrite(str(folder / "demo.jpg"), comparison(gmap), [cv2.IMWRITE_JPEG_QUALITY, 88])
     cv2.imwrite(str(folder / "plan.png"), plan())
     if options.psnr:
-        print_psnr()
+        print_psnr(gmap)
 
 
 if __name__ == "__main__":
