@@ -156,7 +156,7 @@ def fit(
 ) -> Gaussians:
     """The laid map after Adam steps on one view each, in a fixed random order.
 
-    The same bytes on one machine; other CPUs may round sums differently, see compare.py.
+    The same bytes each time with one instruction set; others round differently, see compare.py.
     """
     free = FreeMap(laid)
     groups = [{"params": [free.free[name]], "lr": rate} for name, rate in RATES.items()]

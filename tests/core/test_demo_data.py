@@ -280,10 +280,11 @@ def test_map_renders_like_the_photos(
         T_cam_map = np.linalg.inv(true_poses(messages)[index])
         rgb, _, alpha = gmap.render(pinhole, T_cam_map)
         rendered = np.clip(rgb * 255, 0, 255)
-        assert psnr(rendered, camera.undistort(clean)[0]) > 24
+        assert psnr(rendered, camera.undistort(clean)[0]) > 29
         assert correlation(rendered, photo) > 0.93
-        # fitting thins corners a little; a hole would be far below
+        # the fit draws dark lines by leaving thin places before the black background
         assert float(np.quantile(alpha, 0.01)) > 0.8, "holes in the map"
+        assert float(np.mean(alpha < 0.5)) < 5e-4, "holes in the map"
         # a gap remains: the map was not made from these photos, nor they from it
         assert psnr(fitted(rendered, photo.astype(float)), photo) < 40
 
@@ -296,9 +297,9 @@ def test_map_depth_is_the_rooms(
     _, depth, _ = gmap.render(pinhole, np.linalg.inv(T_map_cam))
     cast_depth = RayCaster(room).cast(_pinhole_rays(pinhole), T_map_cam)[1]
     relative = np.abs(depth - cast_depth) / cast_depth
-    # of overlapping Gaussians the nearer hides the farther: a bias of about one percent
-    assert float(np.median(relative)) < 0.015
-    assert float(np.quantile(relative, 0.9)) < 0.04
+    # of overlapping Gaussians the nearer hides the farther: fitting leaves half a percent of it
+    assert float(np.median(relative)) < 0.01
+    assert float(np.quantile(relative, 0.9)) < 0.025
 
 
 def _pinhole_rays(camera: Camera) -> Rays:
