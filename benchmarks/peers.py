@@ -56,7 +56,6 @@ from igaussian_core.evaluate.rendered import (
     RenderedQueries,
     camera_of,
     shows_enough,
-    sphere_of,
     targets,
 )
 from igaussian_core.evaluate.report import machine_facts
@@ -65,6 +64,7 @@ from igaussian_core.geometry import compose, rotation_from_vector
 from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import MapPackage, open_package
 from igaussian_core.posed_images import PosedImage
+from igaussian_core.sphere import sphere_of
 from igaussian_core.view_planning import SourceView
 from igaussian_core.views import spherical_views
 

@@ -92,10 +92,11 @@ def eval_rendered(
     from igaussian_core.evaluate import rendered
     from igaussian_core.gaussian_map import load_map
     from igaussian_core.map_package import open_package
+    from igaussian_core.sphere import sphere_of
 
     package = open_package(map_path)
     scale = package.T_map_scene.scale
-    sphere = rendered.sphere_of(package)
+    sphere = sphere_of(package)
     chosen: dict[str, Any] = {
         "radius": radius / scale if radius else None,
         "centre": numbers(centre, 3, "--centre"),

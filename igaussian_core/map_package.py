@@ -4,6 +4,7 @@
       manifest.json           version, frames, bounds, hashes; written last
       gaussians.ply           the Gaussians, INRIA layout
       landmarks.safetensors   source views and the 3D points seen in them
+      network.safetensors     the pose network trained on the map, where one was
 
 Only data formats are read: opening a map never runs code.
 """
@@ -22,7 +23,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
 from igaussian_core.errors import MapError
@@ -37,6 +38,7 @@ VERSION = 1
 _MANIFEST = "manifest.json"
 _GAUSSIANS = "gaussians.ply"
 _LANDMARKS = "landmarks.safetensors"
+_NETWORK = "network.safetensors"
 
 
 @dataclass(frozen=True)
@@ -93,12 +95,26 @@ class Landmarks:
 
 
 @dataclass(frozen=True)
+class NetworkData:
+    """A trained pose network as it is stored; `coarse.network` knows what it means.
+
+    Attributes:
+        tensors: by name.
+        meta: text by name.
+    """
+
+    tensors: dict[str, NDArray[Any]]
+    meta: dict[str, str]
+
+
+@dataclass(frozen=True)
 class MapPackage:
-    """A compiled map in memory."""
+    """A compiled map in memory; `network` is None where none was trained."""
 
     manifest: Manifest
     gaussians: GaussianMap
     landmarks: Landmarks
+    network: NetworkData | None = None
 
     @property
     def T_map_scene(self) -> Sim3:
@@ -169,7 +185,10 @@ def open_package(path: str | os.PathLike[str]) -> MapPackage:
     if source.is_file() and file_sha256(source) != manifest.source_sha256:
         log.warning("%s: %s was changed since; compile it again to use the new one",
                     folder, source)  # fmt: skip
-    return MapPackage(manifest, load_map(ply), _read_landmarks(folder / _LANDMARKS))
+    return MapPackage(
+        manifest, load_map(ply), _read_landmarks(folder / _LANDMARKS),
+        _read_network(folder / _NETWORK),
+    )  # fmt: skip
 
 
 def with_T_map_scene(path: str | os.PathLike[str], T_map_scene: Sim3) -> Manifest:
@@ -190,6 +209,17 @@ def with_T_map_scene(path: str | os.PathLike[str], T_map_scene: Sim3) -> Manifes
     return manifest
 
 
+def with_network(path: str | os.PathLike[str], network: NetworkData) -> None:
+    """Give a compiled map a trained network, in place of the one that it may have.
+
+    Raises:
+        MapError: no compiled map, or it cannot be written.
+    """
+    folder = Path(path)
+    _read_manifest(folder)
+    _write_network(network, folder)
+
+
 def _write(package: MapPackage, folder: Path) -> None:
     landmarks = package.landmarks
     save_ply(package.gaussians, folder / _GAUSSIANS)
@@ -203,10 +233,37 @@ def _write(package: MapPackage, folder: Path) -> None:
         },
         str(folder / _LANDMARKS),
     )
+    if package.network is not None:
+        _write_network(package.network, folder)
     manifest = dataclasses.replace(
         package.manifest, gaussians_sha256=file_sha256(folder / _GAUSSIANS)
     )
     _write_manifest(manifest, folder)
+
+
+def _write_network(network: NetworkData, folder: Path) -> None:
+    temporary = folder / (_NETWORK + ".new")
+    try:
+        save_file(network.tensors, str(temporary), network.meta)
+        temporary.replace(folder / _NETWORK)
+    except (OSError, SafetensorError) as error:
+        raise MapError(f"{folder / _NETWORK}: cannot be written: {error}") from error
+
+
+def _read_network(file: Path) -> NetworkData | None:
+    if not file.is_file():
+        return None
+    try:
+        return read_tensors(file)
+    except (OSError, SafetensorError) as error:
+        raise MapError(f"{file}: unreadable pose network: {error}") from error
+
+
+def read_tensors(file: Path) -> NetworkData:
+    """All of a safetensors file; raises what safetensors does."""
+    with safe_open(str(file), "numpy") as opened:
+        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+        return NetworkData(tensors, opened.metadata() or {})
 
 
 def _write_manifest(manifest: Manifest, folder: Path) -> None:

@@ -24,18 +24,17 @@ from igaussian_core.evaluate.image_changes import Change, changed
 from igaussian_core.gaussian_map import GaussianMap
 from igaussian_core.geometry import Sim3, inverse
 from igaussian_core.map_package import MapPackage
+from igaussian_core.sphere import Sphere
 from igaussian_core.views import look_at, spherical_views, up_rotation
 
 Array = NDArray[np.float64]
 
 BINS_DEG = ((20.0, 40.0), (40.0, 80.0), (80.0, 180.0))
-SCENE_RADIUS = 0.1  # the paper's, map units
 _MAX_ELEVATION = np.radians(75.0)
 _MIN_COVERED = 0.6  # share of a scene's target that the map must cover
 _MIN_EDGES = 0.05  # share of its cells of 10x10 pixels that must hold an edge
 _EDGE = 6.0  # grey levels a pixel, at 160 pixels
 _TRIES = 200
-_FLOATERS = 20  # Gaussians that may be nearer than the nearest surface
 
 
 @dataclass(frozen=True)
@@ -48,44 +47,6 @@ class Target:
     T_scene_cam: Array
     T_scene_source: Array
     seed: int
-
-
-@dataclass(frozen=True)
-class Sphere:
-    """The sphere of source poses that targets start from, scene units and axes."""
-
-    kind: str
-    radius: float
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-
-
-def sphere_of(package: MapPackage) -> Sphere:
-    """The paper's sphere in a compiled map: about an object's middle with the map's radius; in
-    a scene R = 0.1 about the source view with most room around it."""
-    poses = package.landmarks.T_scene_cam
-    mean_up = -poses[:, :3, 1].mean(axis=0)
-    x, y, z = mean_up / np.linalg.norm(mean_up)
-    kind = package.manifest.kind
-    if kind == "object":
-        low, high = np.array(package.manifest.bounds)
-        centre, radius = 0.5 * (low + high), package.manifest.radius
-    else:
-        centre = _roomiest(package.gaussians, poses[:, :3, 3])
-        radius = SCENE_RADIUS / package.T_map_scene.scale
-    return Sphere(kind, radius, tuple(map(float, centre)), (float(x), float(y), float(z)))  # type: ignore[arg-type]
-
-
-def _roomiest(gmap: GaussianMap, positions: Array) -> Array:
-    """The position whose nearest solid Gaussians are farthest away; a few may float there."""
-    solid = gmap.means[gmap.opacities > 0.5]
-    if len(solid) <= _FLOATERS:
-        return np.asarray(positions[0])
-    clearance = [
-        np.partition(np.linalg.norm(solid - p, axis=1), _FLOATERS)[_FLOATERS]
-        for p in positions.astype(np.float32)
-    ]
-    return np.asarray(positions[int(np.argmax(clearance))])
 
 
 def targets(

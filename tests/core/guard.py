@@ -27,12 +27,12 @@ from igaussian_core.evaluate.rendered import (
     RenderedQueries,
     camera_of,
     shows_enough,
-    sphere_of,
     targets,
 )
 from igaussian_core.evaluate.runner import run
 from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import MapPackage
+from igaussian_core.sphere import sphere_of
 
 ROOT = Path(__file__).resolve().parents[2]
 STORED = ROOT / "tests" / "data" / "guard.json"

@@ -29,10 +29,8 @@ from igaussian_core.evaluate.photos import PhotoQueries
 from igaussian_core.evaluate.rendered import (
     BINS_DEG,
     RenderedQueries,
-    Sphere,
     camera_of,
     shows_enough,
-    sphere_of,
     targets,
 )
 from igaussian_core.evaluate.report import Evaluation, write_csv, write_html, write_json
@@ -43,6 +41,7 @@ from igaussian_core.geometry import Sim3, pose_error
 from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import open_package
 from igaussian_core.result import LocalizationResult, Status
+from igaussian_core.sphere import Sphere, sphere_of
 from igaussian_core.tum import read_tum
 from igaussian_core.views import look_at
 

@@ -1,0 +1,257 @@
+"""The paper's pose attention network and its Weight Predictor Module, and what it was made into.
+
+Section III-A of the paper, with N source views of known pose rendered from the map:
+
+    K^i, V^i = concat(phi_r(I), phi_r(x_s^i))       Q^i = MLP(pose of x_s^i), 128 numbers
+    V^i_1 = FFN_1(softmax(Q K^T / sqrt(d)) V) + V   V^i_2 = FFN_2(V^i_1)   T_i = xi_D(V^i_2)
+    w = softmax over i of g(V^i_2)                  T_coarse = sum of w^i T_i
+
+The equations leave open over what the softmax runs. `NetworkConfig(attention="views")` is their
+literal form: one feature vector an image, so that it runs over the source views.
+"tokens" keeps the image's 16-pixel cells apart: each source pose asks the cells of the target,
+with heads, for what tells its relative pose. `lookup` goes before it: every cell of the target
+is compared with every cell of every source view, and is told where in the scene those that
+resemble it lie (their rendered depth gives the scene coordinates). "none" asks nothing and
+averages the cells: the ablation's plain concatenation; with one view of
+no pose it is plain regression.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from igaussian_core.coarse.backbone import attend, make_backbone
+
+ATTENTIONS = ("tokens", "views", "none")
+_QUERY = 128  # the paper's
+_HEADS = 4
+_LOOKUP = 64  # dimensions in which cells are compared
+_HALF_WIDE = 2.0  # scene coordinates are clamped to so many lengths
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """What the network is made of.
+
+    Attributes:
+        backbone: one of backbone.BACKBONES.
+        attention: "tokens", "views" (the paper's literal form) or "none".
+        lookup: compare the target's cells with the source views' and hand on their places.
+        relative: candidates are predicted in their source camera's frame, else in the scene's.
+        weights: combine candidates by the WPM, else by their plain mean.
+        width: features of a cell and of a source view.
+    """
+
+    backbone: str = "small"
+    attention: str = "tokens"
+    lookup: bool = True
+    relative: bool = True
+    weights: bool = True
+    width: int = 192
+
+
+class SourceViews(NamedTuple):
+    """N source views of each of B maps, or of one map (B = 1), in normalised units.
+
+    Attributes:
+        features: [B, N, C, h, w], the backbone's.
+        points: [B, N, h, w, 3] scene coordinates of the cells' centres.
+        known: [B, N, h, w] bool, where those mean something.
+        rotation: [B, N, 3, 3] of T_scene_cam.
+        position: [B, N, 3].
+    """
+
+    features: Tensor
+    points: Tensor
+    known: Tensor
+    rotation: Tensor
+    position: Tensor
+
+
+class Prediction(NamedTuple):
+    """What the network says of B images with N source views.
+
+    Attributes:
+        rotation: [B, 3, 3] of the weighted mean, T_scene_cam.
+        position: [B, 3], normalised units.
+        candidate_rotations: [B, N, 3, 3].
+        candidate_positions: [B, N, 3].
+        log_weights: [B, N], logarithms of weights that sum to one.
+        points: [B, h, w, 3] scene coordinates of the cells' centres.
+    """
+
+    rotation: Tensor
+    position: Tensor
+    candidate_rotations: Tensor
+    candidate_positions: Tensor
+    log_weights: Tensor
+    points: Tensor
+
+
+class PoseNetwork(nn.Module):
+    """Image and source views in, coarse pose out.
+
+    Args:
+        config: what it is made of.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.backbone = make_backbone(config.backbone)
+        width, channels = config.width, self.backbone.channels
+        self.target_cells = nn.Linear(channels, width)
+        self.source_cells = nn.Linear(channels, width)
+        self.rays = _mlp(2, 64, width)
+        if config.lookup:
+            self.compare_target = nn.Linear(channels, _LOOKUP)
+            self.compare_source = nn.Linear(channels, _LOOKUP)
+            self.log_sharpness = nn.Parameter(torch.tensor(2.5))
+            self.places = _mlp(3 + 4, 128, width)
+        self.cells = _Residual(width)
+        self.points = _mlp(width, 128, 3)
+        self.query = _mlp(9, _QUERY, _QUERY)
+        self.key = nn.Linear(width, _QUERY)
+        self.value = nn.Linear(width, 2 * width)
+        self.pooled = nn.Linear(width, 2 * width)
+        self.ffn1 = _mlp(2 * width, 2 * width, 2 * width)
+        self.ffn2 = _mlp(2 * width + _QUERY, 2 * width, width)
+        self.decode = nn.Linear(width, 9)
+        self.weigh = nn.Linear(width, 1)
+        nn.init.zeros_(self.weigh.weight)
+
+    def forward(self, images: Tensor, rays: Tensor, views: SourceViews) -> Prediction:
+        """Poses of images.
+
+        Args:
+            images: float [B, 3, H, W] in [0, 1].
+            rays: [B or 1, h, w, 2] x/z and y/z of the cells' centres.
+            views: of B maps or one.
+        """
+        return self.predict(self.backbone(images), rays, views)
+
+    def predict(self, features: Tensor, rays: Tensor, views: SourceViews) -> Prediction:
+        """As forward, of the backbone's features [B, C, h, w]."""
+        batch, _, height, width = features.shape
+        cells = self.target_cells(_flat(features)) + self.rays(rays).flatten(1, 2)
+        seen = torch.zeros(batch, height * width, 3)
+        if self.config.lookup:
+            seen, evidence = self._look_up(features, views)
+            cells = cells + self.places(torch.cat([seen, evidence], -1))
+        cells = self.cells(cells)
+        points = (seen + self.points(cells).float()).view(batch, height, width, 3)
+        hidden = self._candidates(cells, views)
+        rotations, positions = self._decoded(hidden, views)
+        log_weights = torch.log_softmax(self.weigh(hidden).float().squeeze(-1), 1)
+        if not self.config.weights:
+            log_weights = torch.full_like(log_weights, -float(torch.log(torch.tensor(
+                float(log_weights.shape[1])))))  # fmt: skip
+        weights = log_weights.exp()[..., None]
+        return Prediction(
+            rotation=_orthonormal((weights[..., None] * rotations).sum(1)[..., :2]),
+            position=(weights * positions).sum(1),
+            candidate_rotations=rotations,
+            candidate_positions=positions,
+            log_weights=log_weights,
+            points=points,
+        )
+
+    def _look_up(self, features: Tensor, views: SourceViews) -> tuple[Tensor, Tensor]:
+        """Where in the scene the target's cells probably are: [B, U, 3], and evidence [B, U, 4].
+
+        Attention of every cell of the target over all cells of all source views; the values
+        are scene coordinates.
+        """
+        maps, count = views.features.shape[:2]
+        ours = F.normalize(self.compare_target(_flat(features)).float(), dim=-1)
+        theirs = self.compare_source(_flat(views.features.flatten(0, 1)))
+        theirs = F.normalize(theirs.float(), dim=-1)
+        theirs = theirs.reshape(maps, -1, _LOOKUP)
+        scores = self.log_sharpness.exp() * (ours @ theirs.transpose(1, 2))
+        known = views.known.reshape(maps, 1, -1)
+        share = torch.softmax(scores.masked_fill(~known, -1e4), -1)
+        points = views.points.reshape(maps, -1, 3)
+        mean = share @ points
+        variance = (share @ points.square() - mean.square()).clamp(min=0).sum(-1, keepdim=True)
+        peak = share.amax(-1, keepdim=True)
+        best = scores.amax(-1, keepdim=True) / self.log_sharpness.exp()
+        return mean, torch.cat([variance.add(1e-6).sqrt(), peak, best, best * 0 + 1], -1)
+
+    def _candidates(self, cells: Tensor, views: SourceViews) -> Tensor:
+        """One hidden vector [B, N, width] a source view: V^i_2 of the paper."""
+        batch, maps, count = len(cells), *views.features.shape[:2]
+        code = torch.cat([views.rotation[..., :2].flatten(2), views.position], -1)
+        query = self.query(code)
+        source = self.source_cells(_flat(views.features.flatten(0, 1)).mean(1))
+        source = source.view(maps, count, -1)
+        # the projection of a concatenation is the sum of two projections: the source views'
+        # part is computed once
+        value = self.value(cells)
+        pooled = value.mean(1)[:, None] + self.pooled(source)
+        if self.config.attention == "views":
+            keys = self.key(cells.mean(1)[:, None] + source)
+            found = attend(query.expand_as(keys), keys, pooled)
+        elif self.config.attention == "tokens":
+            found = self._ask(query, self.key(cells), value, batch) + self.pooled(source)
+        else:
+            found = pooled
+        first = self.ffn1(found) + pooled
+        query = query.expand(batch, -1, -1)
+        return F.gelu(self.ffn2(torch.cat([first, query.to(first.dtype)], -1)))
+
+    def _ask(self, query: Tensor, keys: Tensor, value: Tensor, batch: int) -> Tensor:
+        """What each source pose [B or 1, N, 128] finds among the target's cells."""
+        def split(x: Tensor) -> Tensor:
+            return x.unflatten(-1, (_HEADS, -1)).transpose(1, 2)
+
+        query = split(query.expand(batch, -1, -1).to(keys.dtype))
+        found = attend(query, split(keys), split(value))
+        return found.transpose(1, 2).flatten(2)
+
+    def _decoded(self, hidden: Tensor, views: SourceViews) -> tuple[Tensor, Tensor]:
+        numbers = self.decode(hidden).float()
+        base = numbers.new_tensor([1.0, 0, 0, 0, 1, 0])
+        columns = numbers[..., :6] + base
+        rotation = _orthonormal(columns.unflatten(-1, (2, 3)).transpose(-1, -2))
+        position = numbers[..., 6:]
+        if not self.config.relative:
+            return rotation, position
+        # not as matrix products, which autocast would round to bfloat16
+        turned = (views.rotation[..., None] * rotation[..., None, :, :]).sum(-2)
+        moved = (views.rotation * position[..., None, :]).sum(-1)
+        return turned, views.position + moved
+
+
+def _mlp(inside: int, middle: int, outside: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inside, middle), nn.GELU(), nn.Linear(middle, outside))
+
+
+class _Residual(nn.Module):
+    """A normalised two-layer perceptron and its shortcut."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.mlp = _mlp(width, 2 * width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.mlp(self.norm(x))
+
+
+def _flat(features: Tensor) -> Tensor:
+    """[B, C, h, w] as cells [B, h * w, C]."""
+    return features.permute(0, 2, 3, 1).flatten(1, 2)
+
+
+def _orthonormal(columns: Tensor) -> Tensor:
+    """Rotations [..., 3, 3] whose first two columns come from [..., 3, 2] by Gram and Schmidt
+    (the continuous representation of Zhou et al. 2019)."""
+    x = F.normalize(columns[..., 0], dim=-1)
+    y = columns[..., 1]
+    y = F.normalize(y - (x * y).sum(-1, keepdim=True) * x, dim=-1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], -1)

@@ -1,0 +1,207 @@
+"""Hypotheses from the pose network: one forward pass, no iterations, no prior."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import save_file
+from torch import Tensor
+
+from igaussian_core.camera import Camera
+from igaussian_core.coarse.attention import NetworkConfig, PoseNetwork, Prediction, SourceViews
+from igaussian_core.coarse.canonical import cell_rays, resampled, to_tensor
+from igaussian_core.coarse.pose_scale import PoseScale
+from igaussian_core.errors import MapError
+from igaussian_core.geometry import compose, mean_rotation, pose_error
+from igaussian_core.hypothesis import Hypothesis
+from igaussian_core.map_package import NetworkData, read_tensors
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+FORMAT = "igaussian-pose-network-1"
+_WEIGHT = "network."
+_VIEWS = "views."
+# hypotheses nearer than that to one before them are left out
+_SAME_DEG, _SAME_LENGTHS = 5.0, 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class MapNetwork:
+    """A pose network with what it needs of one map.
+
+    Attributes:
+        network: in evaluation mode.
+        views: of the map, normalised units.
+        camera: the canonical camera of images and source views.
+        scale: from normalised to scene units.
+        report: what training says of it: steps, errors on views that it was not trained on.
+    """
+
+    network: PoseNetwork
+    views: SourceViews
+    camera: Camera
+    scale: PoseScale
+    report: dict[str, Any]
+
+    def data(self) -> NetworkData:
+        """As a compiled map stores it."""
+        tensors = {_WEIGHT + k: _stored(v) for k, v in self.network.state_dict().items()}
+        for name, value in self.views._asdict().items():
+            # half of the precision is plenty for features
+            tensors[_VIEWS + name] = _stored(value.half() if name == "features" else value)
+        meta = {
+            "config": dataclasses.asdict(self.network.config),
+            "camera": [getattr(self.camera, f) for f in _CAMERA],
+            "scale": dataclasses.asdict(self.scale),
+            "report": self.report,
+        }
+        return NetworkData(tensors, {"format": FORMAT, "network": json.dumps(meta)})
+
+    @staticmethod
+    def from_data(data: NetworkData, origin: str) -> MapNetwork:
+        """Raises MapError, naming `origin`, where anything is missing, left over or misshapen."""
+        config, meta = _config_of(data.meta, origin)
+        network = PoseNetwork(config)
+        _load(network, data.tensors, origin)
+        try:
+            views = SourceViews(
+                **{f: torch.from_numpy(data.tensors[_VIEWS + f]) for f in SourceViews._fields}
+            )
+            camera = Camera(**dict(zip(_CAMERA, meta["camera"], strict=True)))
+            scale = PoseScale(tuple(meta["scale"]["centre"]), float(meta["scale"]["length"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise MapError(f"{origin}: damaged pose network: {error}") from error
+        views = views._replace(features=views.features.float())
+        return MapNetwork(network.eval(), views, camera, scale, meta.get("report", {}))
+
+
+class NetworkLocalizer:
+    """Coarse poses of images in one map.
+
+    Args:
+        trained: the map's network.
+        hypotheses: most that are handed on.
+    """
+
+    def __init__(self, trained: MapNetwork, hypotheses: int) -> None:
+        self._trained = trained
+        self._count = hypotheses
+        self._rays = cell_rays(trained.camera)[None]
+
+    @torch.inference_mode()
+    def predict(self, image: Image, camera: Camera) -> Prediction:
+        """What the network says of an image of a pinhole camera, normalised units, batch 1."""
+        trained = self._trained
+        x = to_tensor(resampled(image, camera, trained.camera)[None])
+        return trained.network(x, self._rays, trained.views)
+
+    def hypotheses(self, image: Image, camera: Camera) -> Iterator[Hypothesis]:
+        """The weighted mean first, then source views' candidates by falling weight that say
+        something else.
+
+        Args:
+            image: uint8 RGB [H, W, 3].
+            camera: its pinhole camera.
+        """
+        found: list[Array] = []
+        for T_scene_cam, score in self._poses(self.predict(image, camera)):
+            if len(found) == self._count:
+                return
+            if all(self._differs(T_scene_cam, other) for other in found):
+                found.append(T_scene_cam)
+                yield Hypothesis(T_scene_cam, score, "network")
+
+    def _poses(self, prediction: Prediction) -> Iterator[tuple[Array, float]]:
+        rotations, positions = (
+            part[0].double().numpy()
+            for part in (prediction.candidate_rotations, prediction.candidate_positions)
+        )
+        weights = prediction.log_weights[0].double().exp().numpy()
+        scene = self._trained.scale.scene
+        mean = compose(mean_rotation(rotations, weights), scene(weights @ positions))
+        yield mean, 1.0
+        for index in np.argsort(-weights, kind="stable"):
+            yield compose(rotations[index], scene(positions[index])), float(weights[index])
+
+    def _differs(self, T_a: Array, T_b: Array) -> bool:
+        angle, distance = pose_error(T_a, T_b)
+        return angle > _SAME_DEG or distance > _SAME_LENGTHS * self._trained.scale.length
+
+
+_CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
+
+
+def _stored(value: Tensor) -> NDArray[Any]:
+    return np.ascontiguousarray(value.detach().cpu().numpy())
+
+
+def save_checkpoint(network: PoseNetwork, path: Path, report: dict[str, Any]) -> None:
+    """Weights alone in half precision, for every map to start from.
+
+    Raises:
+        MapError: `path` cannot be written.
+    """
+    state = {
+        _WEIGHT + k: (v.half() if v.is_floating_point() else v).contiguous()
+        for k, v in network.state_dict().items()
+    }
+    meta = {"config": dataclasses.asdict(network.config), "report": report}
+    try:
+        save_file(state, str(path), {"format": FORMAT, "network": json.dumps(meta)})
+    except (OSError, SafetensorError) as error:
+        raise MapError(f"{path}: cannot be written: {error}") from error
+
+
+def load_checkpoint(path: Path) -> PoseNetwork:
+    """The network of a checkpoint, in training mode.
+
+    Raises:
+        MapError: missing, unreadable, or parameters missing, left over, of other shapes.
+    """
+    try:
+        data = read_tensors(path)
+    except (OSError, SafetensorError) as error:
+        raise MapError(f"{path}: unreadable weights: {error}") from error
+    config, _ = _config_of(data.meta, str(path))
+    network = PoseNetwork(config)
+    _load(network, data.tensors, str(path))
+    return network
+
+
+def shipped_checkpoint() -> Path:
+    """The joint checkpoint that comes with the project."""
+    return Path(__file__).resolve().parents[1] / "weights" / "pose_network.safetensors"
+
+
+def _config_of(meta: dict[str, str], origin: str) -> tuple[NetworkConfig, dict[str, Any]]:
+    if meta.get("format") != FORMAT:
+        raise MapError(f"{origin}: no pose network of this release (format {meta.get('format')})")
+    try:
+        parsed = json.loads(meta["network"])
+        return NetworkConfig(**parsed["config"]), parsed
+    except (KeyError, TypeError, ValueError) as error:
+        raise MapError(f"{origin}: damaged pose network: {error}") from error
+
+
+def _load(network: PoseNetwork, tensors: dict[str, NDArray[Any]], origin: str) -> None:
+    state = {
+        name.removeprefix(_WEIGHT): torch.from_numpy(np.asarray(value)).to(
+            torch.float32 if value.dtype.kind == "f" else torch.int64
+        )
+        for name, value in tensors.items()
+        if name.startswith(_WEIGHT)
+    }
+    try:
+        network.load_state_dict(state, strict=True)
+    except RuntimeError as error:
+        cause = "; ".join(line.strip() for line in str(error).splitlines()[1:])
+        raise MapError(f"{origin}: weights do not fit the network: {cause[:300]}") from error

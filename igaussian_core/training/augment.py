@@ -1,0 +1,83 @@
+"""What may befall a photo, done to renders so that the network learns to live with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+Uniform = Callable[..., Tensor]
+
+
+def composite(rgba: Tensor, background: Tensor) -> Tensor:
+    """Float images [B, H, W, 3] in [0, 1] of uint8 [B, H, W, 4], colours premultiplied by alpha,
+    over colours [B or 1, 3]."""
+    alpha = rgba[..., 3:].float() / 255
+    return rgba[..., :3].float() / 255 + (1 - alpha) * background[:, None, None]
+
+
+def augmented(rgba: Tensor, background: Tensor, generator: torch.Generator) -> Tensor:
+    """Float images [B, 3, H, W] in [0, 1] with changes drawn anew for each.
+
+    Background, exposure, white balance, gamma, offset, blur, noise, an occluder, and a border
+    that the camera does not see.
+
+    Args:
+        rgba: uint8 [B, H, W, 4], colours premultiplied by alpha.
+        background: the map's own colour [3] in [0, 1].
+    """
+    count, height, width = rgba.shape[:3]
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(shape, generator=generator)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=generator)
+
+    own = uniform(count, 1) < 0.6
+    images = composite(rgba, torch.where(own, background, uniform(count, 3)))
+    gain = torch.exp(0.2 * normal(count, 1, 1, 1) + 0.07 * normal(count, 1, 1, 3))
+    gamma = torch.exp(0.22 * normal(count, 1, 1, 1))
+    images = images.clamp(1e-3, 1).pow_(gamma).mul_(gain)
+    images += 0.03 * normal(count, 1, 1, 1)
+    images = _blurred(images, uniform(count, 1, 1, 1))
+    noise = 0.15 * uniform(count, 1, 1, 1).square()
+    images += noise * (uniform(count, height, width, 1) - 0.5)
+    hidden = _rectangles(uniform, count, height, width)
+    images = torch.where(hidden, uniform(count, 1, 1, 3), images)
+    images = torch.where(_borders(uniform, count, height, width), background, images)
+    images = images.clamp_(0, 1).permute(0, 3, 1, 2)
+    return images.contiguous(memory_format=torch.channels_last)
+
+
+def _blurred(images: Tensor, chance: Tensor) -> Tensor:
+    """A third of the images as they are, half mixed with a mean over 3x3 pixels, the rest
+    blurred twice so."""
+    x = images.permute(0, 3, 1, 2)
+    once = F.avg_pool2d(x, 3, 1, 1, count_include_pad=False)
+    twice = F.avg_pool2d(once, 3, 1, 1, count_include_pad=False)
+    share = chance.permute(0, 3, 1, 2)
+    mixed = x + (2 * share - 2 / 3).clamp(0, 1) * (once - x)
+    return torch.where(share > 0.85, twice, mixed).permute(0, 2, 3, 1)
+
+
+def _rectangles(uniform: Uniform, count: int, height: int, width: int) -> Tensor:
+    """Mask [B, H, W, 1] of one rectangle in a third of the images, else empty."""
+    size = 0.05 + 0.35 * uniform(count, 2)
+    corner = uniform(count, 2) * (1 - size)
+    present = uniform(count, 1) < 0.33
+    y, x = torch.arange(height) / height, torch.arange(width) / width
+    rows = (y > corner[:, :1]) & (y < (corner + size)[:, :1]) & present
+    columns = (x > corner[:, 1:]) & (x < (corner + size)[:, 1:])
+    return (rows[:, :, None] & columns[:, None, :])[..., None]
+
+
+def _borders(uniform: Uniform, count: int, height: int, width: int) -> Tensor:
+    """Mask [B, H, W, 1] of a frame around a fifth of the images, else empty."""
+    cut = 0.18 * uniform(count, 2) * (uniform(count, 1) < 0.2)
+    y, x = (torch.arange(height) + 0.5) / height - 0.5, (torch.arange(width) + 0.5) / width - 0.5
+    rows = y.abs() > 0.5 - cut[:, :1]
+    columns = x.abs() > 0.5 - cut[:, 1:]
+    return (rows[:, :, None] | columns[:, None, :])[..., None]

@@ -1,0 +1,158 @@
+"""Training views of one map: rendered in the background, kept, replaced by new ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from igaussian_core.camera import Camera
+from igaussian_core.coarse.canonical import cell_centres, cell_rays
+from igaussian_core.coarse.pose_scale import PoseScale, contracted
+from igaussian_core.errors import MapError
+from igaussian_core.gaussian_map import GaussianMap
+from igaussian_core.geometry import inverse
+from igaussian_core.training.poses import PoseSampler
+
+Array = NDArray[np.float64]
+
+_MIN_COVERED = 0.6  # share of a scene's view that the map must cover
+_CHUNK = 64
+_TRIES = 60  # chunks without a usable view before a map is given up
+
+
+class Views(NamedTuple):
+    """Rendered views with their truth, in normalised units.
+
+    Attributes:
+        rgba: uint8 [N, H, W, 4], colours premultiplied by alpha.
+        points: float32 [N, h, w, 3], contracted scene coordinates of the cells' centres.
+        known: bool [N, h, w], where the map covers them.
+        rotation: float32 [N, 3, 3] of T_scene_cam.
+        position: float32 [N, 3].
+    """
+
+    rgba: Tensor
+    points: Tensor
+    known: Tensor
+    rotation: Tensor
+    position: Tensor
+
+    def at(self, index: NDArray[np.int64]) -> Views:
+        """Some of them."""
+        chosen = torch.from_numpy(index)
+        return Views(*(part[chosen] for part in self))
+
+
+@dataclass(frozen=True)
+class ViewRenderer:
+    """Renders what the network sees of a map.
+
+    Attributes:
+        gmap: the map.
+        camera: the network's canonical camera.
+        scale: normalisation of positions.
+        min_covered: share of a view that the map must cover for it to be used.
+    """
+
+    gmap: GaussianMap
+    camera: Camera
+    scale: PoseScale
+    min_covered: float
+    threads: int = 2
+
+    def render(self, T_scene_cam: Array) -> tuple[Views, NDArray[np.bool_]]:
+        """Views of poses [N, 4, 4], and which of them show enough."""
+        T = np.asarray(T_scene_cam, np.float64)
+        render = self.gmap.rasterizer().render_batch(
+            self.camera, inverse(T), threads=self.threads
+        )
+        assert render.rgb is not None and render.depth is not None and render.alpha is not None
+        alpha = render.alpha[..., None]
+        rgba = np.concatenate([np.clip(render.rgb, 0, 1), alpha], -1) * 255 + 0.5
+        u, v = np.round(np.moveaxis(cell_centres(self.camera), -1, 0)).astype(int)
+        rays = cell_rays(self.camera).numpy().astype(np.float64)
+        ahead = np.concatenate([rays, np.ones_like(rays[..., :1])], -1)
+        points = ahead * render.depth[:, v, u, None].astype(np.float64)
+        points = np.einsum("nij,nhwj->nhwi", T[:, :3, :3], points) + T[:, None, None, :3, 3]
+        views = Views(
+            rgba=torch.from_numpy(rgba.astype(np.uint8)),
+            points=torch.from_numpy(contracted(self.scale.normalized(points)).astype(np.float32)),
+            known=torch.from_numpy(render.alpha[:, v, u] > 0.5),
+            rotation=torch.from_numpy(T[:, :3, :3].astype(np.float32)),
+            position=torch.from_numpy(self.scale.normalized(T[:, :3, 3]).astype(np.float32)),
+        )
+        covered = (render.alpha > 0.5).mean(axis=(1, 2))
+        return views, np.asarray(covered >= self.min_covered)
+
+
+def draw_views(
+    renderer: ViewRenderer,
+    sampler: PoseSampler,
+    rng: np.random.Generator,
+    count: int,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Views:
+    """`count` usable views.
+
+    Raises:
+        MapError: the map shows next to nothing from where the sampler draws.
+    """
+    found: list[Views] = []
+    total = failed = 0
+    while total < count:
+        views, usable = renderer.render(sampler.draw(rng, _CHUNK))
+        index = np.flatnonzero(usable)[: count - total]
+        failed = 0 if len(index) else failed + 1
+        if failed > _TRIES:
+            raise MapError("training: the map shows nothing from where views are drawn")
+        found.append(views.at(index))
+        total += len(index)
+        progress(total, count)
+    return Views(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+
+
+class Bank:
+    """Views of one map, the oldest of which are replaced while training goes on.
+
+    Args:
+        size: how many are kept.
+    """
+
+    def __init__(
+        self,
+        renderer: ViewRenderer,
+        sampler: PoseSampler,
+        size: int,
+        seed: int,
+        progress: Callable[[int, int], None] = lambda done, of: None,
+    ) -> None:
+        self._renderer, self._sampler = renderer, sampler
+        self._rng = np.random.default_rng(seed)
+        self.views = draw_views(renderer, sampler, self._rng, size, progress)
+        self._next = 0
+        self._order = np.zeros(0, np.int64)
+
+    def __len__(self) -> int:
+        return len(self.views.rgba)
+
+    def batch(self, count: int) -> Views:
+        """`count` views, each of the bank's once before any again."""
+        while len(self._order) < count:
+            self._order = np.concatenate([self._order, self._rng.permutation(len(self))])
+        index, self._order = self._order[:count], self._order[count:]
+        return self.views.at(index)
+
+    def refresh(self, count: int) -> None:
+        """Replace the oldest views by up to `count` new ones."""
+        count = min(count, len(self) - self._next)
+        new, usable = self._renderer.render(self._sampler.draw(self._rng, count))
+        index = np.flatnonzero(usable)
+        for old, fresh in zip(self.views, new.at(index), strict=True):
+            old[self._next : self._next + len(index)] = fresh
+        self._next = (self._next + len(index)) % len(self)

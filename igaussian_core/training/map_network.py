@@ -1,0 +1,167 @@
+"""A pose network for one compiled map: source views, training views, training, its report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from igaussian_core.camera import Camera
+from igaussian_core.coarse.attention import PoseNetwork
+from igaussian_core.coarse.canonical import canonical_camera, cell_rays
+from igaussian_core.coarse.network import MapNetwork
+from igaussian_core.coarse.pose_scale import PoseScale
+from igaussian_core.map_package import MapPackage
+from igaussian_core.sphere import Sphere, sphere_of
+from igaussian_core.training.bank import Bank, ViewRenderer, draw_views
+from igaussian_core.training.pose_network import (
+    Curve,
+    Trainer,
+    TrainingMap,
+    TrainOptions,
+    held_out_errors,
+    lambda_t,
+    source_views,
+)
+from igaussian_core.training.poses import PoseSampler
+from igaussian_core.views import spherical_views, spread_indices
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+
+BANK = 6000
+HELD_OUT = 256
+_MIN_COVERED = 0.6  # of a scene's view; an object may fill little of one
+_NEAR_KNOWN = {"object": 0.3, "scene": 0.55}
+_HELD_OUT_SEED = 1_000_003
+
+
+class Setting(NamedTuple):
+    """What training needs to know of a map."""
+
+    renderer: ViewRenderer
+    sampler: PoseSampler
+    source_poses: Array
+    background: torch.Tensor
+
+
+def setting_of(package: MapPackage, sources: int = 16, threads: int = 2) -> Setting:
+    """Of a compiled map.
+
+    Args:
+        sources: how many source views; an object's are the paper's on its sphere, a scene's
+            are spread over the compiled source views, since the paper's sphere of R = 0.1 sees
+            a room from one place only.
+    """
+    sphere, known = sphere_of(package), package.landmarks.T_scene_cam
+    scale = _scale_of(sphere, known)
+    width, height, fx, fy, cx, cy = map(float, package.landmarks.intrinsics[0])
+    camera = canonical_camera(Camera(int(width), int(height), fx, fy, cx, cy))
+    is_object = sphere.kind == "object"
+    renderer = ViewRenderer(
+        package.gaussians, camera, scale, 0.0 if is_object else _MIN_COVERED, threads
+    )
+    sampler = PoseSampler(sphere, scale.length, known, _NEAR_KNOWN[sphere.kind])
+    if is_object:
+        poses = object_sources(sphere, sources)
+    else:
+        poses = known[spread_indices(known, sources, 2 * scale.length)]
+    background = torch.tensor(package.manifest.background, dtype=torch.float32)
+    return Setting(renderer, sampler, poses, background)
+
+
+def object_sources(sphere: Sphere, count: int) -> Array:
+    """The paper's 8, 12, 16 or 20 views: four azimuths at each of several elevations."""
+    elevations = {
+        4: (0.0,), 8: (-30.0, 30.0), 12: (-45.0, 0.0, 45.0), 16: (-60.0, -30.0, 30.0, 60.0),
+        20: (-60.0, -30.0, 0.0, 30.0, 60.0),
+    }  # fmt: skip
+    nearest = min(elevations, key=lambda views: abs(views - count))
+    poses = spherical_views(
+        "object", sphere.radius, sphere.centre, sphere.up, elevations_deg=elevations[nearest]
+    )
+    return poses[:count]
+
+
+def training_map(
+    name: str,
+    setting: Setting,
+    bank: int,
+    seed: int,
+    progress: Progress = lambda stage, done, of: None,
+    held_out: int = HELD_OUT,
+) -> TrainingMap:
+    """A map's source views, its bank, and views that are never trained on.
+
+    Raises:
+        MapError: the map shows next to nothing from where views are drawn.
+    """
+    renderer, sampler = setting.renderer, setting.sampler
+    sources, _ = renderer.render(setting.source_poses)
+    aside = draw_views(renderer, sampler, np.random.default_rng(_HELD_OUT_SEED + seed), held_out)
+    views = Bank(
+        renderer, sampler, bank, seed, lambda done, of: progress("training views", done, of)
+    )
+    return TrainingMap(
+        name, views, sources, aside, setting.background, cell_rays(renderer.camera),
+        lambda_t(sampler.sphere.kind),
+    )  # fmt: skip
+
+
+def train_map_network(
+    package: MapPackage,
+    start: PoseNetwork,
+    options: TrainOptions,
+    *,
+    sources: int = 16,
+    bank: int = BANK,
+    threads: int = 2,
+    checkpoint: Path | None = None,
+    progress: Progress = lambda stage, done, of: None,
+) -> tuple[MapNetwork, Curve]:
+    """Train a network, from `start`'s weights, on views that a compiled map renders of itself.
+
+    Raises:
+        MapError: the map shows next to nothing from where views are drawn.
+    """
+    torch.manual_seed(options.seed)
+    setting = setting_of(package, sources, threads)
+    data = training_map(package.manifest.name, setting, bank, options.seed, progress)
+    trainer = Trainer(start, [data], options, checkpoint)
+    curve = trainer.run(progress)
+    return trained_network(trainer.network, data, setting, options), curve
+
+
+def trained_network(
+    network: PoseNetwork, data: TrainingMap, setting: Setting, options: TrainOptions
+) -> MapNetwork:
+    """A network in evaluation mode with a map's source views and a report on held-out views."""
+    degrees, lengths = held_out_errors(network, data)
+    scale = setting.renderer.scale
+    report = {
+        "options": asdict(options),
+        "held_out_views": len(degrees),
+        "median_deg": float(np.median(degrees)),
+        "median_distance": float(np.median(lengths)) * scale.length,
+        "length": scale.length,
+        "within_15_deg": float((degrees < 15).mean()),
+    }
+    return MapNetwork(
+        network.eval(), source_views(network, data), setting.renderer.camera, scale, report
+    )
+
+
+def _scale_of(sphere: Sphere, known: Array) -> PoseScale:
+    """An object's sphere; a scene's cameras, their mean and their largest distance from it."""
+    if sphere.kind == "object":
+        return PoseScale(sphere.centre, sphere.radius)
+    centre = known[:, :3, 3].mean(axis=0)
+    extent = float(np.linalg.norm(known[:, :3, 3] - centre, axis=1).max())
+    return PoseScale(tuple(map(float, centre)), max(extent, sphere.radius))  # type: ignore[arg-type]
+
+
