@@ -31,7 +31,7 @@ LAYERS = [
     ["views", "lifting", "pnp", "features", "query", "map_package", "camera_traces"],
     ["overview"],
     ["view_planning", "map_summary"],
-    ["pruning"],
+    ["pruning", "procedural"],
     ["coarse", "refine"],
     ["localizer"],
     ["tracker", "replay", "compile_map", "train", "evaluate"],
