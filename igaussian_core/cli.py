@@ -28,12 +28,14 @@ from igaussian_core.cli_tools import (
     numbers,
     progress_bars,
 )
+from igaussian_core.cli_train import train_app
 from igaussian_core.errors import ConfigError, IGaussianError
 
 app = typer.Typer(help=__doc__, no_args_is_help=True, pretty_exceptions_enable=False)
 map_app = typer.Typer(help="Compile, inspect and align maps.", no_args_is_help=True)
 app.add_typer(map_app, name="map")
 app.add_typer(eval_app, name="eval")
+app.add_typer(train_app, name="train")
 
 def main() -> None:
     """Entry point: a known error is one line on stderr and exit code 1."""

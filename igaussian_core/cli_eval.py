@@ -44,6 +44,9 @@ ChangeOption = Annotated[
     list[str] | None,
     typer.Option("--change", help="of the images: paper, gain=, gamma=, jpeg=, blur=, noise="),
 ]
+StageOneOption = Annotated[
+    bool, typer.Option("--stage-one", help="judge stage one alone: its first hypothesis")
+]
 JobsOption = Annotated[
     int, typer.Option(help="processes of one thread each; timings then mean little", min=1, max=64)
 ]
@@ -79,6 +82,7 @@ def eval_rendered(
     max_distance: Annotated[
         float, typer.Option(help="success: position error below, map units", min=1e-9)
     ] = 0.05,
+    stage_one: StageOneOption = False,
     jobs: JobsOption = 1,
     json_out: JsonOption = None,
     csv_out: CsvOption = None,
@@ -127,7 +131,7 @@ def eval_rendered(
     _evaluate(
         "rendered", map_path, queries, facts, load_config(config, set_), jobs,
         (max_deg, float("inf") if rotation_only else max_distance),
-        _Outputs(json_out, csv_out, report, tum, results),
+        _Outputs(json_out, csv_out, report, tum, results), stage_one,
     )  # fmt: skip
 
 
@@ -150,6 +154,7 @@ def eval_photos(
     max_distance: Annotated[
         float | None, typer.Option(help="the same in map units, instead", min=1e-9)
     ] = None,
+    stage_one: StageOneOption = False,
     jobs: JobsOption = 1,
     json_out: JsonOption = None,
     csv_out: CsvOption = None,
@@ -182,7 +187,7 @@ def eval_photos(
     }  # fmt: skip
     evaluation = _evaluate(
         "photos", map_path, queries, facts, load_config(config, set_), jobs, (max_deg, limit),
-        _Outputs(json_out, csv_out, report, tum, results),
+        _Outputs(json_out, csv_out, report, tum, results), stage_one,
     )  # fmt: skip
     for o in evaluation.outcomes:
         if not (o.angle_deg < max_deg and o.distance < limit):
@@ -310,8 +315,10 @@ def _evaluate(
     jobs: int,
     limits: tuple[float, float],
     outputs: _Outputs,
+    stage_one: bool = False,
 ) -> Any:
-    """Run the queries through a localizer, say the figures, write what was asked for."""
+    """Run the queries through a localizer, or through its stage one alone; say the figures,
+    write what was asked for."""
     from igaussian_core.evaluate.report import Evaluation, machine_facts
     from igaussian_core.evaluate.runner import Partial, run
     from igaussian_core.map_package import open_package
@@ -321,6 +328,7 @@ def _evaluate(
         runtime = dataclasses.replace(config.runtime, threads=1)
         config = dataclasses.replace(config, runtime=runtime)
     names = [queries.name(index) for index in range(len(queries))]
+    facts = facts | ({"stage": "one alone, unverified"} if stage_one else {})
     key = json.dumps([track, manifest.gaussians_sha256, facts, names, config.to_flat()])
     path = outputs.partial()
     if path is not None:
@@ -329,7 +337,8 @@ def _evaluate(
     open_localizer = functools.partial(_open_warm, map_path, config)
     with progress_bars() as progress:
         stages = Stages(progress)
-        done = run(open_localizer, queries, partial, jobs, lambda d, n: stages(track, d, n))
+        opener = functools.partial(_open_coarse, map_path, config) if stage_one else open_localizer
+        done = run(opener, queries, partial, jobs, lambda d, n: stages(track, d, n))
     facts = {
         "map": f"{map_path} ({manifest.kind}, {manifest.source_file})", **facts,
         "processes": str(jobs), **machine_facts(),
@@ -352,6 +361,13 @@ def _open_warm(map_path: Path, config: Any) -> Any:
     localizer = Localizer.open(map_path, config)
     localizer.warm_up()
     return localizer
+
+
+def _open_coarse(map_path: Path, config: Any) -> Any:
+    from igaussian_core.evaluate.coarse_estimator import CoarseOnly
+    from igaussian_core.map_package import open_package
+
+    return CoarseOnly(open_package(map_path), config)
 
 
 def _write(evaluation: Any, queries: Any, open_localizer: Any, outputs: _Outputs) -> None:

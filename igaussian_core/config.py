@@ -54,7 +54,14 @@ class FeatureConfig:
 
 @dataclass(frozen=True)
 class CoarseConfig:
-    """Stage one: landmarks compiled from the map."""
+    """Stage one: landmarks compiled from the map, the pose network trained on it, or both."""
+
+    method: str = _option(
+        "cascade",
+        "network: the paper's, trained on the map; landmarks: keypoints of the map's source "
+        "views; cascade: the network is asked first where the map has one, then the landmarks",
+        choices=("network", "landmarks", "cascade"),
+    )
 
     rank_keypoints: int = _option(256, "query keypoints that rank the source views", 32, 4096)
     rank_landmarks: int = _option(192, "landmarks of each source view used in ranking", 32, 4096)
@@ -62,6 +69,9 @@ class CoarseConfig:
     max_reprojection_px: float = _option(8.0, "inlier threshold of landmark PnP in pixels", 0.5, 64)
     min_inliers: int = _option(12, "least inliers of a hypothesis", 4, 1000)
     hypotheses: int = _option(3, "hypotheses handed to stage two", 1, 16)
+    network_hypotheses: int = _option(
+        2, "hypotheses of the pose network handed to stage two", 1, 16
+    )
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from igaussian_core.camera import Camera
 from igaussian_core.coarse.landmarks import LandmarkLocalizer
+from igaussian_core.coarse.network import MapNetwork, NetworkLocalizer
 from igaussian_core.config import Config
 from igaussian_core.errors import CameraError, MapError
 from igaussian_core.features import Matcher, make_matcher
@@ -45,6 +46,7 @@ class Localizer:
         self._landmarks = LandmarkLocalizer(
             package.landmarks, self._config.coarse, self._matcher.min_similarity
         )
+        self._network = _network_of(package, self._config)
         self._refiner = Refiner(
             self._render_scene, self._matcher, self._config.features.keypoints,
             self._config.refine, self._config.verify,
@@ -98,9 +100,7 @@ class Localizer:
             Status.NO_HYPOTHESIS, "no place in the map resembles the image", source="landmarks"
         )
         for hypothesis in self._hypotheses(query, prior):
-            refinement = self._refiner.refine(
-                query, hypothesis.T_scene_cam, near=hypothesis.source == "prior"
-            )
+            refinement = self._refine(query, hypothesis)
             result = self._result(hypothesis, refinement)
             if result.ok:
                 return _timed(result, timer)
@@ -117,6 +117,9 @@ class Localizer:
         features = self._matcher.extract(image, self._config.features.keypoints)
         self._landmarks.rank_views(features)
         self._matcher.match(features, features)
+        if self._network is not None:
+            camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+            next(self._network.hypotheses(image, camera))
 
     def render(self, camera: Camera, T_map_cam: ArrayLike) -> tuple[Image, Image, Image]:
         """RGB [H, W, 3], depth [H, W] in metres and alpha [H, W] of the map at a pose.
@@ -140,18 +143,26 @@ class Localizer:
         return small.undistort(image)
 
     def _hypotheses(self, query: Query, prior: ArrayLike | None) -> Iterator[Hypothesis]:
-        """Stage one: the prior, then places that the landmarks know; found as asked for."""
+        """Stage one: the prior, then what the network says, then places that the landmarks know;
+        found as asked for."""
         if prior is not None:
             if not is_rigid(prior):
                 raise CameraError("prior: expected a rigid 4x4 transform T_map_cam")
             yield Hypothesis(self._T_map_scene.inverse().camera(prior), 0.0, "prior")
-        candidates = self._landmarks.hypotheses(query.features, query.camera)
-        while True:
-            with query.timer("coarse"):
-                hypothesis = next(candidates, None)
-            if hypothesis is None:
-                return
-            yield hypothesis
+        if self._network is not None:
+            yield from _timed_each(query, self._network.hypotheses(query.image, query.camera))
+        if self._config.coarse.method != "network":
+            yield from _timed_each(
+                query, self._landmarks.hypotheses(query.features, query.camera)
+            )
+
+    def _refine(self, query: Query, hypothesis: Hypothesis) -> Refinement:
+        """Stage two. What the network says is only aligned in the cascade: where that does not
+        convince, the landmarks cost less than matching descriptors at a wrong place."""
+        if hypothesis.source == "network" and self._config.coarse.method == "cascade":
+            return self._refiner.align(query, hypothesis.T_scene_cam)
+        near = hypothesis.source == "prior"
+        return self._refiner.refine(query, hypothesis.T_scene_cam, near=near)
 
     def _result(self, hypothesis: Hypothesis, refinement: Refinement) -> LocalizationResult:
         evidence = refinement.evidence
@@ -198,6 +209,32 @@ def _matcher_of(package: MapPackage, config: Config) -> Matcher:
             f"{matcher.name} is configured or the only one installed; compile it again"
         )
     return matcher
+
+
+def _network_of(package: MapPackage, config: Config) -> NetworkLocalizer | None:
+    """The map's network where the configuration asks for it and the map has one."""
+    name, method = package.manifest.name, config.coarse.method
+    if method == "landmarks":
+        return None
+    if package.network is None:
+        if method == "network":
+            raise MapError(
+                f"the map '{name}' has no pose network, which coarse.method=network needs: "
+                "'igaussian train map' trains one"
+            )
+        return None
+    trained = MapNetwork.from_data(package.network, f"map '{name}'")
+    return NetworkLocalizer(trained, config.coarse.network_hypotheses)
+
+
+def _timed_each(query: Query, candidates: Iterator[Hypothesis]) -> Iterator[Hypothesis]:
+    """Hypotheses one by one; the frame's timer counts what each takes to be found."""
+    while True:
+        with query.timer("coarse"):
+            hypothesis = next(candidates, None)
+        if hypothesis is None:
+            return
+        yield hypothesis
 
 
 def _covariance_in_map(refinement: Refinement, T_map_scene: Sim3) -> Array | None:

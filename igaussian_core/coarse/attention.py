@@ -56,14 +56,14 @@ class NetworkConfig:
 
 
 class SourceViews(NamedTuple):
-    """N source views of each of B maps, or of one map (B = 1), in normalised units.
+    """N source views of each of M maps, in normalised units.
 
     Attributes:
-        features: [B, N, C, h, w], the backbone's.
-        points: [B, N, h, w, 3] scene coordinates of the cells' centres.
-        known: [B, N, h, w] bool, where those mean something.
-        rotation: [B, N, 3, 3] of T_scene_cam.
-        position: [B, N, 3].
+        features: [M, N, C, h, w], the backbone's.
+        points: [M, N, h, w, 3] scene coordinates of the cells' centres.
+        known: [M, N, h, w] bool, where those mean something.
+        rotation: [M, N, 3, 3] of T_scene_cam.
+        position: [M, N, 3].
     """
 
     features: Tensor
@@ -112,14 +112,15 @@ class PoseNetwork(nn.Module):
             self.compare_target = nn.Linear(channels, _LOOKUP)
             self.compare_source = nn.Linear(channels, _LOOKUP)
             self.log_sharpness = nn.Parameter(torch.tensor(2.5))
-            self.places = _mlp(3 + 4, 128, width)
-        self.cells = _Residual(width)
+            self.places = _mlp(3 + 3, 128, width)
+        self.cells = nn.Sequential(_Residual(width), nn.LayerNorm(width))
         self.points = _mlp(width, 128, 3)
         self.query = _mlp(9, _QUERY, _QUERY)
         self.key = nn.Linear(width, _QUERY)
         self.value = nn.Linear(width, 2 * width)
         self.pooled = nn.Linear(width, 2 * width)
-        self.ffn1 = _mlp(2 * width, 2 * width, 2 * width)
+        self.ffn1 = nn.Sequential(nn.LayerNorm(2 * width), _mlp(2 * width, 2 * width, 2 * width))
+        self.norm = nn.LayerNorm(2 * width)
         self.ffn2 = _mlp(2 * width + _QUERY, 2 * width, width)
         self.decode = nn.Linear(width, 9)
         self.weigh = nn.Linear(width, 1)
@@ -129,16 +130,17 @@ class PoseNetwork(nn.Module):
         """Poses of images.
 
         Args:
-            images: float [B, 3, H, W] in [0, 1].
-            rays: [B or 1, h, w, 2] x/z and y/z of the cells' centres.
-            views: of B maps or one.
+            images: float [B, 3, H, W] in [0, 1]; the first B / M are of the first map.
+            rays: [M, h, w, 2] x/z and y/z of the cells' centres.
+            views: of M maps.
         """
         return self.predict(self.backbone(images), rays, views)
 
     def predict(self, features: Tensor, rays: Tensor, views: SourceViews) -> Prediction:
         """As forward, of the backbone's features [B, C, h, w]."""
         batch, _, height, width = features.shape
-        cells = self.target_cells(_flat(features)) + self.rays(rays).flatten(1, 2)
+        rays = _repeated(self.rays(rays).flatten(1, 2), batch)
+        cells = self.target_cells(_flat(features)) + rays
         seen = torch.zeros(batch, height * width, 3)
         if self.config.lookup:
             seen, evidence = self._look_up(features, views)
@@ -162,16 +164,17 @@ class PoseNetwork(nn.Module):
         )
 
     def _look_up(self, features: Tensor, views: SourceViews) -> tuple[Tensor, Tensor]:
-        """Where in the scene the target's cells probably are: [B, U, 3], and evidence [B, U, 4].
+        """Where in the scene the target's cells probably are: [B, U, 3], and evidence [B, U, 3].
 
         Attention of every cell of the target over all cells of all source views; the values
         are scene coordinates.
         """
-        maps, count = views.features.shape[:2]
+        maps, batch = len(views.features), len(features)
         ours = F.normalize(self.compare_target(_flat(features)).float(), dim=-1)
         theirs = self.compare_source(_flat(views.features.flatten(0, 1)))
         theirs = F.normalize(theirs.float(), dim=-1)
         theirs = theirs.reshape(maps, -1, _LOOKUP)
+        ours = ours.reshape(maps, -1, _LOOKUP)
         scores = self.log_sharpness.exp() * (ours @ theirs.transpose(1, 2))
         known = views.known.reshape(maps, 1, -1)
         share = torch.softmax(scores.masked_fill(~known, -1e4), -1)
@@ -180,36 +183,36 @@ class PoseNetwork(nn.Module):
         variance = (share @ points.square() - mean.square()).clamp(min=0).sum(-1, keepdim=True)
         peak = share.amax(-1, keepdim=True)
         best = scores.amax(-1, keepdim=True) / self.log_sharpness.exp()
-        return mean, torch.cat([variance.add(1e-6).sqrt(), peak, best, best * 0 + 1], -1)
+        evidence = torch.cat([variance.add(1e-6).sqrt(), peak, best], -1)
+        return mean.reshape(batch, -1, 3), evidence.reshape(batch, -1, 3)
 
     def _candidates(self, cells: Tensor, views: SourceViews) -> Tensor:
         """One hidden vector [B, N, width] a source view: V^i_2 of the paper."""
         batch, maps, count = len(cells), *views.features.shape[:2]
         code = torch.cat([views.rotation[..., :2].flatten(2), views.position], -1)
-        query = self.query(code)
+        query = _repeated(self.query(code), batch)
         source = self.source_cells(_flat(views.features.flatten(0, 1)).mean(1))
-        source = source.view(maps, count, -1)
+        source = _repeated(source.view(maps, count, -1), batch)
         # the projection of a concatenation is the sum of two projections: the source views'
         # part is computed once
         value = self.value(cells)
         pooled = value.mean(1)[:, None] + self.pooled(source)
         if self.config.attention == "views":
             keys = self.key(cells.mean(1)[:, None] + source)
-            found = attend(query.expand_as(keys), keys, pooled)
+            found = attend(query.to(keys.dtype), keys, pooled)
         elif self.config.attention == "tokens":
-            found = self._ask(query, self.key(cells), value, batch) + self.pooled(source)
+            found = self._ask(query, self.key(cells), value) + self.pooled(source)
         else:
             found = pooled
-        first = self.ffn1(found) + pooled
-        query = query.expand(batch, -1, -1)
+        first = self.norm(self.ffn1(found) + pooled)
         return F.gelu(self.ffn2(torch.cat([first, query.to(first.dtype)], -1)))
 
-    def _ask(self, query: Tensor, keys: Tensor, value: Tensor, batch: int) -> Tensor:
-        """What each source pose [B or 1, N, 128] finds among the target's cells."""
+    def _ask(self, query: Tensor, keys: Tensor, value: Tensor) -> Tensor:
+        """What each source pose [B, N, 128] finds among the target's cells."""
         def split(x: Tensor) -> Tensor:
             return x.unflatten(-1, (_HEADS, -1)).transpose(1, 2)
 
-        query = split(query.expand(batch, -1, -1).to(keys.dtype))
+        query = split(query.to(keys.dtype))
         found = attend(query, split(keys), split(value))
         return found.transpose(1, 2).flatten(2)
 
@@ -221,10 +224,11 @@ class PoseNetwork(nn.Module):
         position = numbers[..., 6:]
         if not self.config.relative:
             return rotation, position
+        turn = _repeated(views.rotation, len(position))
         # not as matrix products, which autocast would round to bfloat16
-        turned = (views.rotation[..., None] * rotation[..., None, :, :]).sum(-2)
-        moved = (views.rotation * position[..., None, :]).sum(-1)
-        return turned, views.position + moved
+        turned = (turn[..., None] * rotation[..., None, :, :]).sum(-2)
+        moved = (turn * position[..., None, :]).sum(-1)
+        return turned, _repeated(views.position, len(position)) + moved
 
 
 def _mlp(inside: int, middle: int, outside: int) -> nn.Sequential:
@@ -241,6 +245,11 @@ class _Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.mlp(self.norm(x))
+
+
+def _repeated(of_maps: Tensor, batch: int) -> Tensor:
+    """[M, ...] as [batch, ...]: each map's for all of its images."""
+    return of_maps.repeat_interleave(batch // len(of_maps), 0)
 
 
 def _flat(features: Tensor) -> Tensor:

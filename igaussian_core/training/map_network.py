@@ -34,6 +34,7 @@ from igaussian_core.views import spherical_views, spread_indices
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
+OPTIONS = TrainOptions()
 BANK = 6000
 HELD_OUT = 256
 _MIN_COVERED = 0.6  # of a scene's view; an object may fill little of one

@@ -212,9 +212,6 @@ class Trainer:
         sources = [self._source_views(i) for i in chosen]
         rays = torch.stack([m.rays for m in maps])
         weight_t = torch.tensor([m.lambda_t for m in maps]).repeat_interleave(each)
-        if len(maps) > 1:
-            sources = [_repeated(s, each) for s in sources]
-            rays = rays.repeat_interleave(each, 0)
         views = SourceViews(*(torch.cat(parts) for parts in zip(*sources, strict=True)))
         with torch.autocast("cpu", torch.bfloat16):
             prediction = self.network(images, rays, views)
@@ -224,7 +221,7 @@ class Trainer:
         nn.utils.clip_grad_norm_(self.network.parameters(), _CLIP)
         self._optimizer.step()
         self._schedule.step()
-        return float(loss)
+        return float(loss.detach())
 
     def _source_views(self, index: int) -> SourceViews:
         """Features without gradients: the heads learn to compare, the backbone by the targets."""
@@ -306,8 +303,3 @@ def held_out_errors(
         lengths.append((prediction.position - part.position).norm(dim=-1))
     network.train(training)
     return torch.cat(degrees).numpy(), torch.cat(lengths).numpy()
-
-
-def _repeated(views: SourceViews, count: int) -> SourceViews:
-    """Of one map, for each of its images in a batch of several maps."""
-    return SourceViews(*(part.expand(count, *part.shape[1:]) for part in views))

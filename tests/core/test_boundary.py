@@ -29,14 +29,14 @@ LAYERS = [
      "pictures"],
     ["gaussian_map"],
     ["views", "lifting", "pnp", "features", "query", "map_package", "camera_traces"],
-    ["overview"],
+    ["overview", "sphere"],
     ["view_planning", "map_summary"],
     ["pruning", "procedural"],
     ["coarse", "refine"],
     ["localizer"],
-    ["tracker", "replay", "compile_map", "train", "evaluate"],
+    ["tracker", "replay", "training", "compile_map", "evaluate"],
     ["cli_tools"],
-    ["cli_eval"],
+    ["cli_eval", "cli_train"],
     ["cli"],
 ]  # fmt: skip
 LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names}

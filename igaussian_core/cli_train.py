@@ -1,0 +1,123 @@
+"""The command group `igaussian train`: networks, on views that maps render of themselves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from igaussian_core.cli_tools import (
+    ConfigOption,
+    SetOption,
+    Stages,
+    console,
+    load_config,
+    progress_bars,
+)
+
+train_app = typer.Typer(help="Train networks on views that maps render.", no_args_is_help=True)
+
+StepsOption = Annotated[int | None, typer.Option(help="steps of the optimiser", min=1)]
+SeedOption = Annotated[int, typer.Option(help="of everything random")]
+CurvesOption = Annotated[Path | None, typer.Option(help="picture of the curves")]
+BoardOption = Annotated[Path | None, typer.Option(help="folder that TensorBoard reads")]
+AttentionOption = Annotated[str, typer.Option(help="tokens, views (the paper's) or none")]
+
+
+@train_app.command("map")
+def train_map(
+    map_path: Annotated[Path, typer.Argument(help="compiled map directory (.igmap)")],
+    steps: StepsOption = None,
+    start: Annotated[
+        str, typer.Option(help="joint: the shipped weights; random; or a checkpoint file")
+    ] = "joint",
+    sources: Annotated[int, typer.Option(help="source views", min=1, max=64)] = 16,
+    seed: SeedOption = 0,
+    curves: CurvesOption = None,
+    tensorboard: BoardOption = None,
+    attention: AttentionOption = "tokens",
+    config: ConfigOption = None,
+    set_: SetOption = None,
+) -> None:
+    """Train the pose network of a compiled map and store it there; no photo is needed.
+
+    An interrupted training goes on where it was when the same command is given again.
+    """
+    from igaussian_core.map_package import open_package, with_network
+    from igaussian_core.training.map_network import OPTIONS, train_map_network
+
+    package = open_package(map_path)
+    options = _options(OPTIONS, steps, seed)
+    threads = load_config(config, set_).runtime.threads
+    with progress_bars() as progress:
+        trained, curve = train_map_network(
+            package, _start(start, attention), options, sources=sources, threads=threads,
+            checkpoint=map_path.with_name(map_path.name + ".training"), progress=Stages(progress),
+        )  # fmt: skip
+    with_network(map_path, trained.data())
+    _write_curve(curve, curves, tensorboard)
+    console.print(f"{map_path}: {network_summary(trained.report)}")
+
+
+@train_app.command("joint")
+def train_joint(
+    output: Annotated[Path, typer.Option("-o", "--output", help="checkpoint (.safetensors)")],
+    maps: Annotated[int, typer.Option(help="procedural rooms and objects", min=1)] = 150,
+    steps: StepsOption = None,
+    seed: SeedOption = 0,
+    curves: CurvesOption = None,
+    tensorboard: BoardOption = None,
+    attention: AttentionOption = "tokens",
+    threads: Annotated[int, typer.Option(help="of network and renderer", min=1)] = 2,
+) -> None:
+    """Train one network on many procedural maps: what `train map` starts from."""
+    from igaussian_core.coarse.attention import NetworkConfig
+    from igaussian_core.coarse.network import save_checkpoint
+    from igaussian_core.training.joint import OPTIONS, train_jointly
+
+    options = _options(OPTIONS, steps, seed)
+    with progress_bars() as progress:
+        network, curve = train_jointly(
+            maps, seed, options, NetworkConfig(attention=attention), threads,
+            output.with_name(output.name + ".training"), Stages(progress),
+        )  # fmt: skip
+    last = {name: values[-1] for name, values in curve.values.items()}
+    save_checkpoint(network, output, {"maps": maps, "steps": options.steps, **last})
+    _write_curve(curve, curves, tensorboard)
+    console.print(f"{output}: {last}")
+
+
+def network_summary(report: dict[str, Any]) -> str:
+    """One line on how good a map's network is."""
+    return (
+        f"pose network: median error {report['median_deg']:.2f} degrees and "
+        f"{report['median_distance']:.3g} scene units "
+        f"({report['median_distance'] / report['length']:.1%} of {report['length']:.3g}), "
+        f"{report['within_15_deg']:.1%} within 15 degrees, on {report['held_out_views']} views "
+        "that it was not trained on"
+    )
+
+
+def _options(options: Any, steps: int | None, seed: int) -> Any:
+    import dataclasses
+
+    return dataclasses.replace(options, seed=seed, steps=steps or options.steps)
+
+
+def _start(start: str, attention: str) -> Any:
+    from igaussian_core.coarse.attention import NetworkConfig, PoseNetwork
+    from igaussian_core.coarse.network import load_checkpoint, shipped_checkpoint
+
+    if start == "random":
+        return PoseNetwork(NetworkConfig(attention=attention))
+    return load_checkpoint(shipped_checkpoint() if start == "joint" else Path(start))
+
+
+def _write_curve(curve: Any, picture: Path | None, tensorboard: Path | None) -> None:
+    from igaussian_core.training.curves import plot_curve, write_tensorboard
+
+    if picture is not None:
+        plot_curve(curve, picture)
+    if tensorboard is not None:
+        write_tensorboard(curve, tensorboard)
