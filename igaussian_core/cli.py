@@ -28,7 +28,7 @@ from igaussian_core.cli_tools import (
     numbers,
     progress_bars,
 )
-from igaussian_core.cli_train import train_app
+from igaussian_core.cli_train import network_summary, train_app, train_map
 from igaussian_core.errors import ConfigError, IGaussianError
 
 app = typer.Typer(help=__doc__, no_args_is_help=True, pretty_exceptions_enable=False)
@@ -79,6 +79,9 @@ def map_compile(
     ] = None,
     up: Annotated[str | None, typer.Option(help="up direction in the scene: x,y,z")] = None,
     views: Annotated[int, typer.Option(help="most source views", min=1, max=2000)] = 120,
+    train: Annotated[
+        bool, typer.Option(help="train the pose network on the map, too: some ten minutes")
+    ] = False,
     config: ConfigOption = None,
     set_: SetOption = None,
 ) -> None:
@@ -98,6 +101,30 @@ def map_compile(
         f"{landmarks.view_count} source views, {len(landmarks.points):,} landmarks, "
         f"{_megabytes(output):.1f} MB"
     )
+    if train:
+        train_map(output, config=config, set_=set_)
+
+
+@map_app.command("views")
+def map_views(
+    path: Annotated[Path, typer.Argument(help="compiled map directory (.igmap)")],
+    plot: Annotated[Path, typer.Option(help="picture of the camera layout")],
+    count: Annotated[int, typer.Option(help="source views of the pose network", min=1)] = 16,
+) -> None:
+    """Draw where the source views of the pose network stand, and those of the landmarks."""
+    from igaussian_core.map_package import open_package
+    from igaussian_core.pictures import plot_cameras
+    from igaussian_core.training.map_network import setting_of
+
+    package = open_package(path)
+    setting = setting_of(package, count)
+    plot_cameras(
+        plot, package.gaussians.means,
+        {f"{len(setting.source_poses)} source views of the pose network": setting.source_poses,
+         f"{package.landmarks.view_count} of the landmarks": package.landmarks.T_scene_cam},
+        setting.sampler.length,
+    )  # fmt: skip
+    console.print(f"{plot}: {package.manifest.kind}, R = {setting.sampler.sphere.radius:.3g}")
 
 
 @map_app.command("info")
@@ -126,12 +153,19 @@ def _describe(path: Path) -> dict[str, str]:
         return rows | {"size on disk": f"{_megabytes(path):.1f} MB"}
     package = open_package(path)
     m = package.manifest
+    network = {}
+    if package.network is not None:
+        from igaussian_core.coarse.network import MapNetwork
+
+        report = MapNetwork.from_data(package.network, str(path)).report
+        network = {"pose network": network_summary(report)}
     return {
         "compiled from": m.source_file,
         "kind": m.kind,
         "radius": f"{m.radius:.3g}",
         "source views": str(package.landmarks.view_count),
         "landmarks": f"{len(package.landmarks.points):,} ({m.matcher})",
+        **network,
         "scale, map / scene": f"{package.T_map_scene.scale:.6g}",
         "size on disk": f"{_megabytes(path):.1f} MB",
         **summarize(package.gaussians),

@@ -18,7 +18,7 @@ from igaussian_core.cli_tools import (
 
 train_app = typer.Typer(help="Train networks on views that maps render.", no_args_is_help=True)
 
-StepsOption = Annotated[int | None, typer.Option(help="steps of the optimiser", min=1)]
+StepsOption = Annotated[int | None, typer.Option(help="steps of the optimiser", min=0)]
 SeedOption = Annotated[int, typer.Option(help="of everything random")]
 CurvesOption = Annotated[Path | None, typer.Option(help="picture of the curves")]
 BoardOption = Annotated[Path | None, typer.Option(help="folder that TensorBoard reads")]
@@ -57,7 +57,7 @@ def train_map(
         )  # fmt: skip
     with_network(map_path, trained.data())
     _write_curve(curve, curves, tensorboard)
-    console.print(f"{map_path}: {network_summary(trained.report)}")
+    console.print(f"{map_path}: pose network: {network_summary(trained.report)}")
 
 
 @train_app.command("joint")
@@ -91,7 +91,7 @@ def train_joint(
 def network_summary(report: dict[str, Any]) -> str:
     """One line on how good a map's network is."""
     return (
-        f"pose network: median error {report['median_deg']:.2f} degrees and "
+        f"median error {report['median_deg']:.2f} degrees and "
         f"{report['median_distance']:.3g} scene units "
         f"({report['median_distance'] / report['length']:.1%} of {report['length']:.3g}), "
         f"{report['within_15_deg']:.1%} within 15 degrees, on {report['held_out_views']} views "
@@ -102,7 +102,7 @@ def network_summary(report: dict[str, Any]) -> str:
 def _options(options: Any, steps: int | None, seed: int) -> Any:
     import dataclasses
 
-    return dataclasses.replace(options, seed=seed, steps=steps or options.steps)
+    return dataclasses.replace(options, seed=seed, steps=options.steps if steps is None else steps)
 
 
 def _start(start: str, attention: str) -> Any:

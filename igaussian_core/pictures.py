@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -123,3 +124,46 @@ def _write_gif(path: Path, frames: Iterator[Image], frames_per_second: float) ->
     if not cv2.imwriteanimation(str(path), animation):
         raise ImageError(f"{path}: cannot be written")
     return len(animation.frames)
+
+
+def plot_cameras(
+    path: Path,
+    points: NDArray[np.float32],
+    groups: Mapping[str, NDArray[np.float64]],
+    length: float,
+) -> None:
+    """Picture of cameras in a map: positions, viewing directions, and some of its points.
+
+    Args:
+        points: [N, 3], scene units.
+        groups: T_scene_cam [M, 4, 4] by the legend's name.
+        length: of a viewing direction's arrow times four, scene units.
+
+    Raises:
+        ImageError: `path` cannot be written.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=(9, 8), layout="constrained")
+    axes: Any = figure.add_subplot(projection="3d")
+    positions = np.concatenate([T[:, :3, 3] for T in groups.values()])
+    middle = positions.mean(axis=0)
+    reach = 1.3 * max(float(np.abs(positions - middle).max()), length)
+    near = points[(np.abs(points - middle) < reach).all(axis=1)]
+    shown = near[:: max(1, len(near) // 4000)]
+    axes.scatter(*shown.T, s=0.5, color="0.6", alpha=0.5)
+    for colour, (name, T) in zip(("tab:red", "tab:blue"), groups.items(), strict=False):
+        axes.scatter(*T[:, :3, 3].T, s=14, color=colour, label=name)
+        axes.quiver(*T[:, :3, 3].T, *T[:, :3, 2].T, length=length / 4, color=colour, linewidth=0.7)
+    axes.set(xlabel="x", ylabel="y", zlabel="z")
+    axes.set_aspect("equal")
+    axes.legend(loc="upper left")
+    try:
+        figure.savefig(path, dpi=110)
+    except (OSError, ValueError) as error:
+        raise ImageError(f"{path}: cannot be written: {error}") from error
+    finally:
+        plt.close(figure)

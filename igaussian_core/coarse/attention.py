@@ -30,6 +30,7 @@ from igaussian_core.coarse.backbone import attend, make_backbone
 ATTENTIONS = ("tokens", "views", "none")
 _QUERY = 128  # the paper's
 _HEADS = 4
+_HIDDEN = 256
 _LOOKUP = 64  # dimensions in which cells are compared
 _HALF_WIDE = 2.0  # scene coordinates are clamped to so many lengths
 
@@ -50,7 +51,7 @@ class NetworkConfig:
     backbone: str = "small"
     attention: str = "tokens"
     lookup: bool = True
-    relative: bool = True
+    relative: bool = False
     weights: bool = True
     width: int = 192
 
@@ -113,18 +114,20 @@ class PoseNetwork(nn.Module):
             self.compare_source = nn.Linear(channels, _LOOKUP)
             self.log_sharpness = nn.Parameter(torch.tensor(2.5))
             self.places = _mlp(3 + 3, 128, width)
-        self.cells = nn.Sequential(_Residual(width), nn.LayerNorm(width))
-        self.points = _mlp(width, 128, 3)
+        self.cells = _Residual(width)
+        self.points = nn.Linear(channels, 3)
+        self.moved = _mlp(width, 128, 3)
         self.query = _mlp(9, _QUERY, _QUERY)
         self.key = nn.Linear(width, _QUERY)
         self.value = nn.Linear(width, 2 * width)
         self.pooled = nn.Linear(width, 2 * width)
-        self.ffn1 = nn.Sequential(nn.LayerNorm(2 * width), _mlp(2 * width, 2 * width, 2 * width))
-        self.norm = nn.LayerNorm(2 * width)
-        self.ffn2 = _mlp(2 * width + _QUERY, 2 * width, width)
-        self.decode = nn.Linear(width, 9)
-        self.weigh = nn.Linear(width, 1)
-        nn.init.zeros_(self.weigh.weight)
+        self.ffn1 = _mlp(2 * width, 2 * width, 2 * width)
+        self.ffn2 = _mlp(2 * width + _QUERY, 2 * width, _HIDDEN)
+        self.whole = nn.Linear(channels, _HIDDEN)
+        self.decode = nn.Linear(_HIDDEN, 9)
+        self.weigh = nn.Linear(_HIDDEN, 1)
+        for layer in (self.weigh, self.ffn2, self.moved):
+            nn.init.zeros_(list(layer.parameters())[-2])
 
     def forward(self, images: Tensor, rays: Tensor, views: SourceViews) -> Prediction:
         """Poses of images.
@@ -146,8 +149,10 @@ class PoseNetwork(nn.Module):
             seen, evidence = self._look_up(features, views)
             cells = cells + self.places(torch.cat([seen, evidence], -1))
         cells = self.cells(cells)
-        points = (seen + self.points(cells).float()).view(batch, height, width, 3)
-        hidden = self._candidates(cells, views)
+        points = seen + self.points(_flat(features)).float() + self.moved(cells).float()
+        points = points.view(batch, height, width, 3)
+        hidden = self.whole(_flat(features).mean(1))[:, None] + self._candidates(cells, views)
+        hidden = F.relu(hidden)
         rotations, positions = self._decoded(hidden, views)
         log_weights = torch.log_softmax(self.weigh(hidden).float().squeeze(-1), 1)
         if not self.config.weights:
@@ -170,11 +175,12 @@ class PoseNetwork(nn.Module):
         are scene coordinates.
         """
         maps, batch = len(views.features), len(features)
-        ours = F.normalize(self.compare_target(_flat(features)).float(), dim=-1)
+        ours = self.compare_target(_flat(features)).float().reshape(maps, -1, _LOOKUP)
         theirs = self.compare_source(_flat(views.features.flatten(0, 1)))
-        theirs = F.normalize(theirs.float(), dim=-1)
-        theirs = theirs.reshape(maps, -1, _LOOKUP)
-        ours = ours.reshape(maps, -1, _LOOKUP)
+        theirs = theirs.float().reshape(maps, -1, _LOOKUP)
+        # what all cells of a map share tells none from another
+        common = theirs.mean(1, keepdim=True)
+        ours, theirs = F.normalize(ours - common, dim=-1), F.normalize(theirs - common, dim=-1)
         scores = self.log_sharpness.exp() * (ours @ theirs.transpose(1, 2))
         known = views.known.reshape(maps, 1, -1)
         share = torch.softmax(scores.masked_fill(~known, -1e4), -1)
@@ -204,8 +210,8 @@ class PoseNetwork(nn.Module):
             found = self._ask(query, self.key(cells), value) + self.pooled(source)
         else:
             found = pooled
-        first = self.norm(self.ffn1(found) + pooled)
-        return F.gelu(self.ffn2(torch.cat([first, query.to(first.dtype)], -1)))
+        first = self.ffn1(found) + pooled
+        return self.ffn2(torch.cat([first, query.to(first.dtype)], -1))
 
     def _ask(self, query: Tensor, keys: Tensor, value: Tensor) -> Tensor:
         """What each source pose [B, N, 128] finds among the target's cells."""

@@ -25,12 +25,12 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
 OPTIONS = TrainOptions(
-    steps=6000, batch=48, maps_per_batch=4, learning_rate=1.5e-3, refresh=0, validate_every=250
+    steps=4000, batch=32, maps_per_batch=2, learning_rate=1.5e-3, refresh=0, validate_every=200
 )
 _SIDE = 128
 _SOURCES = 16
 _VIEWS = 128  # of each map
-_HELD_OUT = 16
+_HELD_OUT = 24
 
 
 def train_jointly(
@@ -48,6 +48,7 @@ def train_jointly(
         first_seed: of the maps; others than those of a test.
     """
     torch.manual_seed(options.seed)
+    torch.set_num_threads(threads)
     data = []
     for index in range(maps):
         data.append(procedural_training_map(first_seed + index, threads))

@@ -131,6 +131,7 @@ def train_map_network(
         MapError: the map shows next to nothing from where views are drawn.
     """
     torch.manual_seed(options.seed)
+    torch.set_num_threads(threads)
     setting = setting_of(package, sources, threads)
     data = training_map(package.manifest.name, setting, bank, options.seed, progress)
     trainer = Trainer(start, [data], options, checkpoint)

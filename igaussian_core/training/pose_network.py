@@ -23,7 +23,6 @@ Progress = Callable[[str, int, int], None]
 
 _LAMBDA_R = 1.0  # the paper's, on degrees
 _LAMBDA_T = 30.0  # the paper's, on map units where an object's radius is 4
-_CHECKPOINT_EVERY = 500
 _CLIP = 50.0
 
 
@@ -32,7 +31,7 @@ class TrainOptions:
     """How long and how.
 
     Attributes:
-        steps: of the optimiser.
+        steps: of the optimiser; 0 leaves the weights as they are.
         batch: target views a step.
         maps_per_batch: of joint training.
         learning_rate: peak of one cycle.
@@ -159,14 +158,16 @@ class Trainer:
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.maps, self.options = maps, options
         self.curve = Curve()
-        self._step = 0
+        self.save_every = 500  # steps
+        self.step = 0
         self._rng = np.random.default_rng(options.seed)
         self._random = torch.Generator().manual_seed(options.seed)
         self._optimizer = torch.optim.AdamW(
             network.parameters(), lr=options.learning_rate, weight_decay=0.02
         )
         self._schedule = torch.optim.lr_scheduler.OneCycleLR(
-            self._optimizer, options.learning_rate, total_steps=options.steps, pct_start=0.15
+            self._optimizer, options.learning_rate, total_steps=max(options.steps, 1),
+            pct_start=0.15,
         )
         self._sources: dict[int, SourceViews] = {}
         self._checkpoint = checkpoint
@@ -179,7 +180,7 @@ class Trainer:
         self.network.train()
         with ThreadPoolExecutor(1) as renderer:
             pending = renderer.submit(lambda: None)
-            while self._step < options.steps:
+            while self.step < options.steps:
                 pending.result()
                 chosen = self._rng.choice(
                     len(self.maps), min(options.maps_per_batch, len(self.maps)), replace=False
@@ -189,12 +190,12 @@ class Trainer:
                     bank = self.maps[chosen[0]].bank
                     pending = renderer.submit(bank.refresh, options.refresh)
                 loss = self._learn(list(chosen), batches)
-                self._step += 1
-                if self._step % options.validate_every == 0 or self._step == options.steps:
+                self.step += 1
+                if self.step % options.validate_every == 0 or self.step == options.steps:
                     self._note(loss)
-                if self._checkpoint is not None and self._step % _CHECKPOINT_EVERY == 0:
+                if self._checkpoint is not None and self.step % self.save_every == 0:
                     self._save(self._checkpoint)
-                progress("training", self._step, options.steps)
+                progress("training", self.step, options.steps)
             pending.result()
         self.network.eval()
         if self._checkpoint is not None:
@@ -225,7 +226,7 @@ class Trainer:
 
     def _source_views(self, index: int) -> SourceViews:
         """Features without gradients: the heads learn to compare, the backbone by the targets."""
-        stale = len(self.maps) > 1 or self._step % self.options.sources_every == 0
+        stale = len(self.maps) > 1 or self.step % self.options.sources_every == 0
         if stale or index not in self._sources:
             self._sources[index] = source_views(self.network, self.maps[index])
         return self._sources[index]
@@ -234,14 +235,14 @@ class Trainer:
         errors = [held_out_errors(self.network, m) for m in self.maps[:8]]
         degrees, lengths = (np.concatenate([e[i] for e in errors]) for i in range(2))
         self.curve.add(
-            self._step, loss=loss, degrees=float(np.median(degrees)),
+            self.step, loss=loss, degrees=float(np.median(degrees)),
             lengths=float(np.median(lengths)), within_15=float((degrees < 15).mean()),
             learning_rate=float(self._schedule.get_last_lr()[0]),
         )  # fmt: skip
 
     def _save(self, path: Path) -> None:
         state = {
-            "options": asdict(self.options), "step": self._step,
+            "options": asdict(self.options), "step": self.step,
             "network": self.network.state_dict(), "optimizer": self._optimizer.state_dict(),
             "schedule": self._schedule.state_dict(), "random": self._random.get_state(),
             "curve": asdict(self.curve),
@@ -261,8 +262,8 @@ class Trainer:
         self._optimizer.load_state_dict(state["optimizer"])
         self._schedule.load_state_dict(state["schedule"])
         self._random.set_state(state["random"])
-        self._step = int(state["step"])
-        self._rng = np.random.default_rng([self.options.seed, self._step])
+        self.step = int(state["step"])
+        self._rng = np.random.default_rng([self.options.seed, self.step])
         self.curve = Curve(**state["curve"])
 
 
