@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from igaussian_core.camera import Camera
 from igaussian_core.coarse.landmarks import LandmarkLocalizer
 from igaussian_core.config import Config
+from igaussian_core.evaluate.coarse_estimator import CoarseOnly
 from igaussian_core.features import Features, Matcher, make_matcher
 from igaussian_core.geometry import compose, inverse
 from igaussian_core.lifting import at_pixels, sample, trusted_depth
@@ -433,30 +434,6 @@ def _exponential(twist: torch.Tensor, length: float) -> torch.Tensor:
 
 
 # --- parts of our own pipeline ---
-
-
-class CoarseOnly:
-    """Stage one alone: PnP over the landmarks of the best source views."""
-
-    def __init__(self, package: MapPackage, config: Config) -> None:
-        self._package, self._config = package, config
-        self._matcher = make_matcher(config.features)
-        self._landmarks = LandmarkLocalizer(
-            package.landmarks, config.coarse, self._matcher.min_similarity
-        )
-
-    def localize(
-        self, image: Image, camera: Camera, prior: ArrayLike | None = None
-    ) -> LocalizationResult:
-        timer = StageTimer()
-        image, camera = shrunk(image, camera, self._config)
-        query = Query(image, camera, self._matcher, self._config.features.keypoints, timer)
-        features = query.features
-        with timer("coarse"):
-            hypothesis = next(self._landmarks.hypotheses(features, camera), None)
-        T = None if hypothesis is None else hypothesis.T_scene_cam
-        inliers = 0 if hypothesis is None else int(hypothesis.score)
-        return _answer(self._package, T, inliers, timer, "landmarks")
 
 
 class Staged:

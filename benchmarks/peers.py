@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 from _data import data_folder
+from _maps import DEMO_ROOM, compiled
 from peer_methods import (
-    CoarseOnly,
     EssentialMatrix,
     GradientDescent,
     Reference,
@@ -36,13 +36,9 @@ from peer_methods import (
 )
 from rich.progress import track
 
-from igaussian_core.compile_map import (
-    CompileOptions,
-    compile_map,
-    lift_landmarks,
-    training_images,
-)
+from igaussian_core.compile_map import lift_landmarks, training_images
 from igaussian_core.config import Config
+from igaussian_core.evaluate.coarse_estimator import CoarseOnly
 from igaussian_core.evaluate.image_changes import parse_change
 from igaussian_core.evaluate.metrics import (
     QueryOutcome,
@@ -62,7 +58,7 @@ from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.evaluate.runner import Estimator, Partial, Queries, run
 from igaussian_core.geometry import compose, rotation_from_vector
 from igaussian_core.localizer import Localizer
-from igaussian_core.map_package import MapPackage, open_package
+from igaussian_core.map_package import MapPackage
 from igaussian_core.posed_images import PosedImage
 from igaussian_core.sphere import sphere_of
 from igaussian_core.view_planning import SourceView
@@ -199,7 +195,7 @@ def main() -> None:
         "rendered": _rendered_table, "rotation": _rotation_table, "photos": _photo_table,
         "ablation": _ablation_table, "views": _views_table,
     }  # fmt: skip
-    report: dict[str, Any] = {"facts": {**machine_facts(), "commit": _commit()}}
+    report: dict[str, Any] = {"facts": {**machine_facts(), "commit": commit()}}
     report["facts"]["queries"] = (
         f"{scale.each} targets a bin ({scale.slow_each} for gradient descent), at most "
         f"{scale.photos} photos a set ({scale.slow_photos}), {scale.references} reference views"
@@ -214,7 +210,7 @@ def main() -> None:
         options.json.write_text(json.dumps(report, indent=1) + "\n")
 
 
-def _commit() -> str:
+def commit() -> str:
     run_ = subprocess.run(
         ["git", "-C", str(ROOT), "describe", "--always", "--dirty"], capture_output=True, text=True
     )
@@ -226,14 +222,15 @@ def _commit() -> str:
 
 def _rendered_table(work: Path, scale: Scale) -> list[dict[str, Any]]:
     cases = [
-        _rendered_case("lego", _lego(work), scale, source_prior=True),
-        _rendered_case("demo room", _room(work), scale, source_prior=True),
+        _rendered_case("lego", compiled(work.parent, "lego"), scale, source_prior=True),
+        _rendered_case("demo room", compiled(work.parent, DEMO_ROOM), scale, source_prior=True),
     ]
     return [row for case in cases for row in _rows(case, PEERS, work, "rendered", scale)]
 
 
 def _rotation_table(work: Path, scale: Scale) -> list[dict[str, Any]]:
-    case = _rendered_case("demo room", _room(work), scale, True, pure_rotation=True)
+    room = compiled(work.parent, DEMO_ROOM)
+    case = _rendered_case("demo room", room, scale, True, pure_rotation=True)
     return _rows(case, PEERS, work, "rotation", scale)
 
 
@@ -246,7 +243,7 @@ def _photo_table(work: Path, scale: Scale) -> list[dict[str, Any]]:
 
 def _ablation_table(work: Path, scale: Scale) -> list[dict[str, Any]]:
     """As table 4: pairs 20 to 40 degrees away, rendered; and the photos of a kitchen."""
-    case = _rendered_case("demo room", _room(work), scale)
+    case = _rendered_case("demo room", compiled(work.parent, DEMO_ROOM), scale)
     kitchen = _photo_case("redkitchen", work, scale)
     near = dataclasses.replace(
         case.queries, targets=tuple(t for t in case.queries.targets if t.bin == "20-40")
@@ -260,7 +257,7 @@ def _ablation_table(work: Path, scale: Scale) -> list[dict[str, Any]]:
 
 def _views_table(work: Path, scale: Scale) -> list[dict[str, Any]]:
     """As figure 5: only so many spherical source views, no training camera is known."""
-    whole, rows = _lego(work), []
+    whole, rows = compiled(work.parent, "lego"), []
     for count, elevations in VIEW_COUNTS.items():
         package = _with_views(whole, elevations)
         rendered = _rendered_case(f"lego, {count} views", package, scale)
@@ -365,7 +362,7 @@ class PriorPhotos(PhotoQueries):
 
 def _photo_case(name: str, work: Path, scale: Scale) -> Case:
     folder = data_folder() / "sets" / name
-    package = _compiled(work, name, folder / "map.ply", folder / "poses.json")
+    package = compiled(work.parent, name)
     training = training_images(folder / "map.ply", folder / "poses.json")
     held_out = held_out_images(folder / "poses.json", None)
     if name == "lego":
@@ -385,23 +382,6 @@ def _photo_case(name: str, work: Path, scale: Scale) -> Case:
         ]
 
     return Case(name, package, functools.cache(references), queries, 5.0, 0.05 * size, scale.steps)
-
-
-def _lego(work: Path) -> MapPackage:
-    folder = data_folder() / "sets" / "lego"
-    return _compiled(work, "lego", folder / "map.ply", folder / "poses.json")
-
-
-def _room(work: Path) -> MapPackage:
-    demo = ROOT / "bags" / "demo"
-    return _compiled(work, "room", demo / "room.ply", demo / "mapping_cameras.json")
-
-
-def _compiled(work: Path, name: str, source: Path, cameras: Path) -> MapPackage:
-    target = work.parent / f"{name}.igmap"
-    if not target.is_dir():
-        compile_map(source, target, cameras, CompileOptions())
-    return open_package(target)
 
 
 def _with_views(package: MapPackage, elevations_deg: tuple[float, ...]) -> MapPackage:

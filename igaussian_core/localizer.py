@@ -46,7 +46,7 @@ class Localizer:
         self._landmarks = LandmarkLocalizer(
             package.landmarks, self._config.coarse, self._matcher.min_similarity
         )
-        self._network = _network_of(package, self._config)
+        self._network = network_of(package, self._config)
         self._refiner = Refiner(
             self._render_scene, self._matcher, self._config.features.keypoints,
             self._config.refine, self._config.verify,
@@ -211,7 +211,7 @@ def _matcher_of(package: MapPackage, config: Config) -> Matcher:
     return matcher
 
 
-def _network_of(package: MapPackage, config: Config) -> NetworkLocalizer | None:
+def network_of(package: MapPackage, config: Config) -> NetworkLocalizer | None:
     """The map's network where the configuration asks for it and the map has one."""
     name, method = package.manifest.name, config.coarse.method
     if method == "landmarks":

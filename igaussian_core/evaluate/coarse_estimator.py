@@ -8,11 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from igaussian_core.camera import Camera
 from igaussian_core.coarse.landmarks import LandmarkLocalizer
-from igaussian_core.coarse.network import MapNetwork, NetworkLocalizer
 from igaussian_core.config import Config
-from igaussian_core.errors import MapError
 from igaussian_core.features import make_matcher
 from igaussian_core.hypothesis import Hypothesis
+from igaussian_core.localizer import network_of
 from igaussian_core.map_package import MapPackage
 from igaussian_core.query import Query
 from igaussian_core.result import LocalizationResult, Status
@@ -22,7 +21,7 @@ Image = NDArray[np.uint8]
 
 
 class CoarseOnly:
-    """The first hypothesis of `coarse.method`; the cascade's is the network's.
+    """The first hypothesis of `coarse.method`, as a Localizer would get it.
 
     Raises:
         MapError: the network is asked for and the map has none.
@@ -30,13 +29,8 @@ class CoarseOnly:
 
     def __init__(self, package: MapPackage, config: Config) -> None:
         self._package, self._config = package, config
-        self._network: NetworkLocalizer | None = None
-        if config.coarse.method != "landmarks":
-            if package.network is None:
-                raise MapError(f"the map '{package.manifest.name}' has no pose network")
-            trained = MapNetwork.from_data(package.network, package.manifest.name)
-            self._network = NetworkLocalizer(trained, 1)
-        else:
+        self._network = network_of(package, config)
+        if self._network is None:
             self._matcher = make_matcher(config.features)
             self._landmarks = LandmarkLocalizer(
                 package.landmarks, config.coarse, self._matcher.min_similarity

@@ -1,0 +1,36 @@
+"""The maps that benchmarks run on, compiled once into a work folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from _data import data_folder
+
+from igaussian_core.compile_map import CompileOptions, compile_map
+from igaussian_core.map_package import MapPackage, open_package
+
+ROOT = Path(__file__).resolve().parents[1]
+DEMO_ROOM = "demo room"
+
+
+def map_sources(name: str) -> tuple[Path, Path]:
+    """Gaussians and training cameras of a set of the data folder, or of the demo room."""
+    if name == DEMO_ROOM:
+        demo = ROOT / "bags" / "demo"
+        return demo / "room.ply", demo / "mapping_cameras.json"
+    folder = data_folder() / "sets" / name
+    return folder / "map.ply", folder / "poses.json"
+
+
+def compiled_path(work: Path, name: str) -> Path:
+    """A compiled map in `work`; compiled there now where it is not yet."""
+    target = work / f"{'room' if name == DEMO_ROOM else name}.igmap"
+    if not target.is_dir():
+        source, cameras = map_sources(name)
+        compile_map(source, target, cameras, CompileOptions())
+    return target
+
+
+def compiled(work: Path, name: str) -> MapPackage:
+    """The same, opened."""
+    return open_package(compiled_path(work, name))

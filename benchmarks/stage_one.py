@@ -1,0 +1,203 @@
+"""Stage one alone: what the pose network reaches on each map, and what each of its parts adds.
+
+    python benchmarks/stage_one.py [--json out.json] [--steps 3000] [--short-steps 1000]
+                                   [--work folder] [--only maps|ablation|views]
+
+`maps`: per map the shipped joint weights without training, the network trained on the map, and
+the landmarks, on the paper's protocol (300 rendered targets) and on held-out photos. `ablation`
+(the paper's table 4, stage one) and `views` (figure 5): lego, from random weights with
+--short-steps each, so that only the part in question differs. A trained network is kept in
+--work, so that an interrupted benchmark goes on. Needs the data folder (_data.py).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from _data import data_folder
+from _maps import DEMO_ROOM, compiled
+from peers import commit
+from safetensors.numpy import save_file
+
+from igaussian_core.coarse.attention import NetworkConfig, PoseNetwork
+from igaussian_core.coarse.network import load_checkpoint, shipped_checkpoint
+from igaussian_core.compile_map import training_images
+from igaussian_core.config import Config
+from igaussian_core.evaluate.coarse_estimator import CoarseOnly
+from igaussian_core.evaluate.image_changes import parse_change
+from igaussian_core.evaluate.metrics import by_group, plain, summarize
+from igaussian_core.evaluate.photos import PhotoQueries, extent, held_out_images
+from igaussian_core.evaluate.rendered import RenderedQueries, camera_of, shows_enough, targets
+from igaussian_core.evaluate.report import machine_facts
+from igaussian_core.evaluate.runner import Queries, run
+from igaussian_core.map_package import MapPackage, NetworkData, read_tensors
+from igaussian_core.sphere import sphere_of
+from igaussian_core.training.map_network import OPTIONS, train_map_network
+
+ROOT = Path(__file__).resolve().parents[1]
+MAPS = ("lego", DEMO_ROOM, "redkitchen", "fox", "flower")
+VIEW_COUNTS = (8, 12, 16, 20)
+PLAIN = NetworkConfig(attention="none", lookup=False, weights=False)
+ABLATION = {
+    "plain regression (one source view, nothing asked)": (PLAIN, 1),
+    "concatenation with 16 source views, plain mean": (PLAIN, 16),
+    "attention over views (the paper's form), plain mean":
+        (NetworkConfig(attention="views", lookup=False, relative=True, weights=False), 16),
+    "attention over views (the paper's form) + WPM":
+        (NetworkConfig(attention="views", lookup=False, relative=True), 16),
+    "attention over cells, plain mean": (NetworkConfig(lookup=False, weights=False), 16),
+    "attention over cells + WPM": (NetworkConfig(lookup=False), 16),
+    "attention over cells and source views + WPM (default)": (NetworkConfig(), 16),
+    "the same with one source view": (NetworkConfig(), 1),
+}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, help="where to write all figures")
+    parser.add_argument("--work", type=Path, default=ROOT / "out" / "stage_one")
+    parser.add_argument("--steps", type=int, default=OPTIONS.steps)
+    parser.add_argument("--short-steps", type=int, default=1000)
+    parser.add_argument("--targets", type=int, default=100, help="in each of three bins")
+    parser.add_argument("--only", choices=("maps", "ablation", "views"))
+    parser.add_argument("--maps", default=",".join(MAPS), help="of the first table")
+    options = parser.parse_args()
+    options.work.mkdir(parents=True, exist_ok=True)
+    tables = {"maps": maps_table, "ablation": ablation_table, "views": views_table}
+    report: dict[str, Any] = {"facts": {**machine_facts(), "commit": commit()}}
+    report["facts"]["training"] = (
+        f"{options.steps} steps of {OPTIONS.batch} views a map; ablation and views "
+        f"{options.short_steps} steps from random weights"
+    )
+    report["facts"]["queries"] = f"{options.targets} rendered targets a bin, held-out photos"
+    for name, make in tables.items():
+        if options.only in (None, name):
+            report[name] = make(options)
+            if options.json:
+                options.json.write_text(json.dumps(report, indent=1) + "\n")
+
+
+def maps_table(options: argparse.Namespace) -> list[dict[str, Any]]:
+    rows = []
+    for name in options.maps.split(","):
+        package = compiled(options.work, name)
+        for label, steps in (("joint weights, map never seen", 0),
+                             ("network trained on the map", options.steps)):  # fmt: skip
+            start = load_checkpoint(shipped_checkpoint())
+            trained, seconds = _trained(
+                package, start, steps, 16, options.work / f"{_file(name)}-{steps}.safetensors"
+            )
+            rows.append(_judged(package, name, label, trained, options)
+                        | {"train_s": seconds, "steps": steps})  # fmt: skip
+        rows.append(_judged(package, name, "landmarks (no training)", None, options))
+    return rows
+
+
+def ablation_table(options: argparse.Namespace) -> list[dict[str, Any]]:
+    package, rows = compiled(options.work, "lego"), []
+    for index, (label, (config, sources)) in enumerate(ABLATION.items()):
+        torch.manual_seed(0)
+        trained, seconds = _trained(
+            package, PoseNetwork(config), options.short_steps, sources,
+            options.work / f"ablation-{index}-{options.short_steps}.safetensors",
+        )  # fmt: skip
+        rows.append(_judged(package, "lego", label, trained, options)
+                    | {"train_s": seconds, "steps": options.short_steps})  # fmt: skip
+    return rows
+
+
+def views_table(options: argparse.Namespace) -> list[dict[str, Any]]:
+    package, rows = compiled(options.work, "lego"), []
+    for count in VIEW_COUNTS:
+        torch.manual_seed(0)
+        trained, seconds = _trained(
+            package, PoseNetwork(NetworkConfig()), options.short_steps, count,
+            options.work / f"views-{count}-{options.short_steps}.safetensors",
+        )  # fmt: skip
+        rows.append(_judged(package, "lego", f"{count} source views", trained, options)
+                    | {"train_s": seconds, "steps": options.short_steps})  # fmt: skip
+    return rows
+
+
+def _trained(
+    package: MapPackage, start: PoseNetwork, steps: int, sources: int, file: Path
+) -> tuple[NetworkData, float]:
+    """A network trained on a map, and the seconds that took; from `file` where it is there."""
+    if not file.is_file():
+        began = time.perf_counter()
+        options = dataclasses.replace(OPTIONS, steps=steps)
+        trained, _ = train_map_network(
+            package, start, options, sources=sources, bank=8 if steps == 0 else 6000
+        )
+        data = trained.data()
+        seconds = time.perf_counter() - began
+        save_file(data.tensors, str(file), {**data.meta, "seconds": str(seconds)})
+    data = read_tensors(file)
+    return data, float(data.meta["seconds"])
+
+
+def _judged(
+    package: MapPackage, name: str, method: str, network: NetworkData | None,
+    options: argparse.Namespace,
+) -> dict[str, Any]:  # fmt: skip
+    config = Config.from_flat({"coarse.method": "network" if network else "landmarks"})
+    estimator = CoarseOnly(dataclasses.replace(package, network=network), config)
+    row: dict[str, Any] = {"case": name, "method": method}
+    row["rendered"], row["groups"] = _figures(estimator, _rendered(package, options.targets))
+    if name != DEMO_ROOM:
+        queries, size = _photos(package, name)
+        row["photos"], _ = _figures(estimator, queries)
+        row["extent"] = size
+    print(name, method, json.dumps({k: _short(v) for k, v in row.items() if isinstance(v, dict)}),
+          flush=True)  # fmt: skip
+    return row
+
+
+def _figures(estimator: CoarseOnly, queries: Queries) -> tuple[dict[str, Any], dict[str, Any]]:
+    outcomes = run(lambda: estimator, queries).outcomes
+    groups = by_group(outcomes)
+    keys = ("queries", "median_deg", "median_distance", "p90_deg", "within_15_deg", "median_ms")
+
+    def kept(figures: Any) -> dict[str, Any]:
+        return {k: v for k, v in plain(summarize(figures, 15.0, np.inf)).items() if k in keys}
+
+    return kept(outcomes), {k: kept(v) for k, v in groups.items()}
+
+
+def _short(figures: dict[str, Any]) -> Any:
+    return [figures.get(k) for k in ("median_deg", "median_distance", "within_15_deg")]
+
+
+def _rendered(package: MapPackage, each: int) -> RenderedQueries:
+    sphere, camera = sphere_of(package), camera_of(package)
+    usable = [shows_enough(package.gaussians, camera)] if sphere.kind == "scene" else []
+    red, green, blue = package.manifest.background
+    return RenderedQueries(
+        tuple(targets(sphere, each, 0.2, 0, *usable)), package.gaussians, camera,
+        (red, green, blue), package.T_map_scene, (parse_change("paper"),),
+    )  # fmt: skip
+
+
+def _photos(package: MapPackage, name: str) -> tuple[PhotoQueries, float]:
+    folder = data_folder() / "sets" / name
+    images = held_out_images(folder / "poses.json", None)
+    if name == "lego":
+        images = [image for image in images if image.name.startswith("test")]
+    red, green, blue = package.manifest.background
+    size = extent(training_images(folder / "map.ply", folder / "poses.json"))
+    return PhotoQueries(tuple(images), package.T_map_scene, (red, green, blue)), size
+
+
+def _file(name: str) -> str:
+    return name.replace(" ", "_")
+
+
+if __name__ == "__main__":
+    main()
