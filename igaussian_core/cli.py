@@ -82,6 +82,9 @@ def map_compile(
     train: Annotated[
         bool, typer.Option(help="train the pose network on the map, too: some ten minutes")
     ] = False,
+    train_steps: Annotated[
+        int | None, typer.Option(help="of that training; fewer are quicker and less exact", min=0)
+    ] = None,
     config: ConfigOption = None,
     set_: SetOption = None,
 ) -> None:
@@ -102,7 +105,7 @@ def map_compile(
         f"{_megabytes(output):.1f} MB"
     )
     if train:
-        train_map(output, config=config, set_=set_)
+        train_map(output, steps=train_steps, config=config, set_=set_)
 
 
 @map_app.command("views")

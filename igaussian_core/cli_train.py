@@ -33,6 +33,7 @@ def train_map(
         str, typer.Option(help="joint: the shipped weights; random; or a checkpoint file")
     ] = "joint",
     sources: Annotated[int, typer.Option(help="source views", min=1, max=64)] = 16,
+    bank: Annotated[int, typer.Option(help="rendered views kept at a time", min=32)] = 6000,
     seed: SeedOption = 0,
     curves: CurvesOption = None,
     tensorboard: BoardOption = None,
@@ -52,7 +53,8 @@ def train_map(
     threads = load_config(config, set_).runtime.threads
     with progress_bars() as progress:
         trained, curve = train_map_network(
-            package, _start(start, attention), options, sources=sources, threads=threads,
+            package, _start(start, attention), options, sources=sources, bank=bank,
+            threads=threads,
             checkpoint=map_path.with_name(map_path.name + ".training"), progress=Stages(progress),
         )  # fmt: skip
     with_network(map_path, trained.data())

@@ -223,7 +223,8 @@ def with_network(path: str | os.PathLike[str], network: NetworkData) -> None:
 def _write(package: MapPackage, folder: Path) -> None:
     landmarks = package.landmarks
     save_ply(package.gaussians, folder / _GAUSSIANS)
-    save_file(
+    _save_tensors(
+        folder / _LANDMARKS,
         {
             "points": np.ascontiguousarray(landmarks.points),
             "descriptors": np.ascontiguousarray(landmarks.descriptors.astype(np.float16)),
@@ -231,7 +232,7 @@ def _write(package: MapPackage, folder: Path) -> None:
             "T_scene_cam": np.ascontiguousarray(landmarks.T_scene_cam),
             "intrinsics": np.ascontiguousarray(landmarks.intrinsics),
         },
-        str(folder / _LANDMARKS),
+        {},
     )
     if package.network is not None:
         _write_network(package.network, folder)
@@ -244,10 +245,16 @@ def _write(package: MapPackage, folder: Path) -> None:
 def _write_network(network: NetworkData, folder: Path) -> None:
     temporary = folder / (_NETWORK + ".new")
     try:
-        save_file(network.tensors, str(temporary), network.meta)
+        _save_tensors(temporary, network.tensors, network.meta)
         temporary.replace(folder / _NETWORK)
     except (OSError, SafetensorError) as error:
         raise MapError(f"{folder / _NETWORK}: cannot be written: {error}") from error
+
+
+def _save_tensors(file: Path, tensors: dict[str, NDArray[Any]], meta: dict[str, str]) -> None:
+    save_file(tensors, str(file), meta)
+    # safetensors keeps its files to their owner; a robot's node may run as another user
+    file.chmod(0o644)
 
 
 def _read_network(file: Path) -> NetworkData | None:

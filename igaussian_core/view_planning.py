@@ -177,13 +177,13 @@ def _clear_half(poses: Array, scores: Array) -> Array:
 
 
 def _kind_of(poses: Array, low: Array, high: Array) -> str:
-    """Object where the cameras stand around the map's bulk and look at it."""
+    """Object where the cameras stand around the map's bulk and look at it, not from one side."""
     centre = 0.5 * (low + high)
     outside = ((poses[:, :3, 3] < low) | (poses[:, :3, 3] > high)).any(axis=1).mean()
     towards = centre - poses[:, :3, 3]
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
     directions = towards.mean(axis=0)
-    surround = np.linalg.norm(directions) < 0.8
+    surround = np.linalg.norm(directions) < 0.7
     looking = (np.einsum("ni,ni->n", poses[:, :3, 2], towards) > 0.8).mean()
     return "object" if outside > 0.8 and looking > 0.8 and surround else "scene"
 

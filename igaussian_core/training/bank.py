@@ -22,6 +22,7 @@ from igaussian_core.training.poses import PoseSampler
 Array = NDArray[np.float64]
 
 _MIN_COVERED = 0.6  # share of a scene's view that the map must cover
+_MIN_CONTRAST = 6.0  # grey levels: a bare ceiling tells nobody where he is
 _CHUNK = 64
 _TRIES = 60  # chunks without a usable view before a map is given up
 
@@ -88,7 +89,8 @@ class ViewRenderer:
             position=torch.from_numpy(self.scale.normalized(T[:, :3, 3]).astype(np.float32)),
         )
         covered = (render.alpha > 0.5).mean(axis=(1, 2))
-        return views, np.asarray(covered >= self.min_covered)
+        contrast = rgba[..., :3].mean(-1).std(axis=(1, 2))
+        return views, (covered >= self.min_covered) & (contrast >= _MIN_CONTRAST)
 
 
 def draw_views(

@@ -246,3 +246,8 @@ def test_a_useless_T_map_scene_does_not_spoil_the_map(saved: Path, T: Sim3) -> N
 def test_a_map_may_be_moved(saved: Path, tmp_path: Path) -> None:
     shutil.move(saved, tmp_path / "elsewhere.igmap")
     assert open_package(tmp_path / "elsewhere.igmap").manifest.name == "tiny"
+
+
+def test_others_may_read_a_map(room_igmap: Path) -> None:
+    """It may be compiled by one user and used by the node of another."""
+    assert all(file.stat().st_mode & 0o044 == 0o044 for file in room_igmap.iterdir())
