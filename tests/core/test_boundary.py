@@ -34,7 +34,7 @@ LAYERS = [
     ["pruning", "procedural"],
     ["coarse", "refine"],
     ["localizer"],
-    ["tracker", "replay", "compile_map", "train", "evaluate"],
+    ["tracker", "replay", "compile_map", "train", "train_scale", "evaluate"],
     ["cli_tools"],
     ["cli_eval"],
     ["cli"],
