@@ -1,7 +1,5 @@
 """Training of the scale ViT: pairs rendered from procedural maps, with known poses.
 
-    python -m igaussian_core.train_scale -o out/scale_vit
-
 A run keeps its pairs and its state in the folder and goes on where it was stopped. Supervised are
 the relative pose in units of the render's median depth, and the attention between the images,
 by the rendered depth: without it the network takes far longer to find out what attention is for.
@@ -9,7 +7,6 @@ by the rendered depth: without it the network takes far longer to find out what 
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Callable, Iterator
@@ -23,15 +20,6 @@ import torch
 import torch.nn.functional as F
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -64,10 +52,10 @@ class ScaleTraining:
         every: steps between validations, each of which also saves.
     """
 
-    maps: int = 100
-    places: int = 50
+    maps: int = 120
+    places: int = 60
     held_out_maps: int = 12
-    steps: int = 4000
+    steps: int = 2700
     batch: int = 24
     rate: float = 3e-3
     every: int = 250
@@ -523,40 +511,3 @@ def plot(curves: list[dict[str, float]], file: Path) -> None:
     right.set(xlabel="step", title="median errors, held-out maps", ylim=(0, 100))
     right.legend(fontsize=7)
     figure.savefig(file, dpi=110)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    default = ScaleTraining()
-    parser.add_argument("-o", "--folder", type=Path, default=Path("out/scale_vit"))
-    parser.add_argument("--minutes", type=float, help="stop then; called again, it goes on")
-    parser.add_argument("--threads", type=int, default=2)
-    for name, value in asdict(default).items():
-        parser.add_argument(f"--{name.replace('_', '-')}", type=type(value), default=value)
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """The command."""
-    parser = argparse.ArgumentParser(description="Train the scale ViT on procedural maps.")
-    add_arguments(parser)
-    given = vars(parser.parse_args(arguments))
-    folder, minutes = given.pop("folder"), given.pop("minutes")
-    torch.set_num_threads(given.pop("threads"))
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        TextColumn("left"), TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns) as bars:
-        tasks: dict[str, TaskID] = {}
-
-        def show(stage: str, done: int, of: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=of)
-            bars.update(tasks[stage], completed=done)
-
-        errors = train_scale_vit(folder, ScaleTraining(**given), minutes, show)
-    print(f"{folder}/scale_vit.safetensors: {json.dumps(errors)}")
-
-
-if __name__ == "__main__":
-    main()

@@ -36,7 +36,7 @@ LAYERS = [
     ["localizer"],
     ["tracker", "replay", "compile_map", "train", "train_scale", "evaluate"],
     ["cli_tools"],
-    ["cli_eval"],
+    ["cli_eval", "cli_train_scale"],
     ["cli"],
 ]  # fmt: skip
 LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names}
