@@ -56,14 +56,18 @@ _SHORT = 0.01  # of the depth: a relative error of less says nothing
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--map", action="append", default=[], type=Path)
-    parser.add_argument("--pairs", type=int, default=60, help="of each map")
+    parser.add_argument("--pairs", type=int, default=60, help="of each map; 0: leave the table out")
     parser.add_argument("--procedural", type=int, default=3, help="rooms, and as many objects")
-    parser.add_argument("--each", type=int, default=12, help="targets a bin of the rendered track")
+    parser.add_argument("--each", type=int, default=12, help="targets a bin; 0: no table")
+    parser.add_argument("--solvers", default="paper/vit,paper/depth,pnp/depth", help="of these")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    report = {"length": lengths(arguments), "solver": solvers(arguments)}
+    report = {
+        "length": lengths(arguments) if arguments.pairs else {},
+        "solver": solvers(arguments) if arguments.each else {},
+    }
     if arguments.json:
         arguments.json.write_text(json.dumps(report, indent=1))
 
@@ -193,7 +197,7 @@ def solvers(arguments: argparse.Namespace) -> dict[str, dict[str, dict[str, floa
             package.T_map_scene, (_CHANGE,),
         )  # fmt: skip
         result[path.stem] = {}
-        for solver, scale in (("paper", "vit"), ("paper", "depth"), ("pnp", "depth")):
+        for solver, scale in (row.split("/") for row in arguments.solvers.split(",")):
             config = Config.from_flat({
                 "refine.solver": solver, "refine.scale": scale, "runtime.budget_ms": 60000.0,
                 "runtime.threads": arguments.threads,
