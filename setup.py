@@ -186,7 +186,7 @@ if __name__ == "__main__":
         license="Apache-2.0",
         python_requires=">=3.10",
         packages=find_packages(include=["igaussian_core*", "igaussian_ros*"]),
-        package_data={"": ["py.typed"]},
+        package_data={"": ["py.typed"], "igaussian_core": ["weights/*.safetensors"]},
         data_files=ros_data_files(),
         install_requires=DEPENDENCIES,
         extras_require=EXTRAS,

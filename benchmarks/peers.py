@@ -105,11 +105,12 @@ CONFIG = Config.from_flat(_UNLIMITED)
 SOLVER = Config.from_flat(
     {**_UNLIMITED, "refine.solver": "paper", "refine.scale": "depth"}
 )
+SOLVER_VIT = Config.from_flat({**_UNLIMITED, "refine.solver": "paper", "refine.scale": "vit"})
 SIFT = dataclasses.replace(CONFIG, features=dataclasses.replace(CONFIG.features, matcher="sift"))
 
 
 def _paper(case: Case) -> Estimator:
-    raise NotBuilt("the pose attention network, the essential-matrix solver and the scale ViT")
+    raise NotBuilt("the pose attention network")
 
 
 OURS = Method("ours", lambda c: Localizer(c.package, CONFIG))
@@ -133,9 +134,13 @@ PAPERS_SOLVER = Method(
     "our stage one, the paper's solver (XFeat, RANSAC), scale by depth",
     lambda c: Localizer(c.package, SOLVER),
 )
+PAPERS_SOLVER_VIT = Method(
+    "our stage one, the paper's solver (XFeat, RANSAC), scale by ViT",
+    lambda c: Localizer(c.package, SOLVER_VIT),
+)
 PEERS = (
-    OURS, PAPER, PAPERS_SOLVER, SFM, ESSENTIAL_SIFT, ESSENTIAL_XFEAT, DESCENT_COARSE,
-    DESCENT_PRIOR,
+    OURS, PAPER, PAPERS_SOLVER, PAPERS_SOLVER_VIT, SFM, ESSENTIAL_SIFT, ESSENTIAL_XFEAT,
+    DESCENT_COARSE, DESCENT_PRIOR,
 )  # fmt: skip
 
 
@@ -151,6 +156,7 @@ ABLATION = (
     Method("paper: network + WPM + LoFTR and RANSAC", _paper),
     Method("paper: all", _paper),
     PAPERS_SOLVER,
+    PAPERS_SOLVER_VIT,
     Method("ours: landmarks alone (stage one)", lambda c: CoarseOnly(c.package, CONFIG)),
     Method("ours: + matching and PnP, one round",
            _staged(lambda r, q, T: r.match(q, T), rounds=1)),

@@ -15,8 +15,10 @@ from igaussian_core.cli_tools import (
     load_config,
     progress_bars,
 )
+from igaussian_core.cli_train_scale import register
 
 train_app = typer.Typer(help="Train networks on views that maps render.", no_args_is_help=True)
+register(train_app)
 
 StepsOption = Annotated[int | None, typer.Option(help="steps of the optimiser", min=0)]
 SeedOption = Annotated[int, typer.Option(help="of everything random")]

@@ -97,8 +97,8 @@ class RefineConfig:
     scale: str = _option(
         "depth",
         "where solver=paper takes the translation's length from; depth: the median ratio of "
-        "rendered and triangulated depth",
-        choices=("depth",),
+        "rendered and triangulated depth; vit: the paper's, a network that sees both images",
+        choices=("depth", "vit"),
     )
     max_sampson_px: float = _option(
         1.0, "inlier threshold of the essential matrix, Sampson error in pixels", 0.1, 32

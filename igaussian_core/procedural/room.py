@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -17,6 +18,8 @@ from igaussian_core.procedural.textures import (
     FURNITURE,
     PICTURES,
     WALLS,
+    Canvas,
+    Image,
     Maker,
     Painter,
     blend,
@@ -45,6 +48,18 @@ def make_room(seed: int) -> ProceduralMap:
     builder.on_walls()
     builder.furnish()
     return builder.finished()
+
+
+@dataclass(frozen=True)
+class _Hanging:
+    """Something flat on a wall: width and height, how far below the ceiling, how deep, painters
+    of its faces, and the share of light that is its own."""
+
+    size: Array
+    top: Callable[[np.random.Generator], float]
+    deep: float
+    painters: list[Painter]
+    glow: float = 0.0
 
 
 class _Builder:
@@ -97,7 +112,7 @@ class _Builder:
         lower, rail = self.painter(WALLS), self.palette.pick(self.rng)
         height, width = self.rng.uniform(0.7, 1.5), self.rng.uniform(0.03, 0.1)
 
-        def paint(canvas):  # type: ignore[no-untyped-def]
+        def paint(canvas: Canvas) -> Image:
             _, y = canvas.grid()
             above = canvas.height - y
             image = blend(lower(canvas), upper(canvas), step(above, height, 0.01))
@@ -156,38 +171,45 @@ class _Builder:
             hangers += [self._picture] * int(self.rng.integers(1, 8))
             hangers += [self._wall_shelf] * int(self.rng.integers(0, 3))
             for hang in hangers:
-                size, top, deep, painter, glow = hang()
+                thing = hang()
+                width, height = thing.size
                 for _ in range(_TRIES):
-                    left = self.rng.uniform(0.05, max(0.06, length - size[0] - 0.05))
-                    drop = top(self.rng)
-                    place = (left, left + size[0], drop, drop + size[1])
-                    if left + size[0] < length - 0.04 and not _overlaps(place, taken, 0.05):
+                    left = self.rng.uniform(0.05, max(0.06, length - width - 0.05))
+                    drop = thing.top(self.rng)
+                    place = (left, left + width, drop, drop + height)
+                    if left + width < length - 0.04 and not _overlaps(place, taken, 0.05):
                         taken.append(place)
                         right = edge / length
-                        middle = corner + right * (left + size[0] / 2) + inward * deep / 2
-                        middle = middle - [0, 0, drop + size[1] / 2]
-                        half = [size[0] / 2, deep / 2, size[1] / 2]
-                        axes = np.stack([right, -inward, [0, 0, 1.0]], axis=1)
-                        self.parts.box(middle, half, painter, axes, "+x-x-y+z-z", glow=glow,
-                                       texel=0.013)  # fmt: skip
+                        self._hang(thing, corner + right * left, right, inward, drop)
                         break
+
+    def _hang(
+        self, thing: _Hanging, corner: Array, right: Array, inward: Array, drop: float
+    ) -> None:
+        """Onto a wall, from a corner at the ceiling; its front is its own -y."""
+        width, height = thing.size
+        middle = corner + right * width / 2 + inward * thing.deep / 2 - [0, 0, drop + height / 2]
+        half = [width / 2, thing.deep / 2, height / 2]
+        axes = np.stack([right, -inward, [0, 0, 1.0]], axis=1)
+        self.parts.box(middle, half, thing.painters, axes, "+x-x-y+z-z", glow=thing.glow,
+                       texel=0.013)  # fmt: skip
 
     def _hung(self, low: float, high: float) -> Callable[[np.random.Generator], float]:
         """Draws how far below the ceiling something's top is."""
         h = self.size[2]
         return lambda rng: float(h - rng.uniform(low, max(low, min(high, h - 0.05))))
 
-    def _door(self):  # type: ignore[no-untyped-def]
+    def _door(self) -> _Hanging:
         size = self.rng.uniform([0.75, 1.9], [1.0, 2.15])
         painter = [self.painter((*FURNITURE, painting))]
-        return size, lambda rng: self.size[2] - size[1] - 0.001, 0.04, painter, 0.0
+        return _Hanging(size, lambda rng: self.size[2] - size[1] - 0.001, 0.04, painter)
 
-    def _window(self):  # type: ignore[no-untyped-def]
+    def _window(self) -> _Hanging:
         size = self.rng.uniform([0.5, 0.6], [1.9, 1.4])
         panes, frame = self.rng.integers(1, 5, 2), self.palette.pick(self.rng)
         view = random_painter(self.rng, self.palette, (painting,))
 
-        def paint(canvas):  # type: ignore[no-untyped-def]
+        def paint(canvas: Canvas) -> Image:
             x, y = canvas.grid()
             u, v = (x / canvas.width * panes[0]) % 1, (y / canvas.height * panes[1]) % 1
             edge = np.minimum(np.minimum(u, 1 - u) * canvas.width / panes[0],
@@ -196,18 +218,19 @@ class _Builder:
             return blend(frame, sky, (edge > 0.03).astype(np.float32))
 
         low = min(self.size[2] - 0.1, 0.9 + size[1])
-        return size, self._hung(low, low + 0.4), 0.05, [paint], 0.6
+        return _Hanging(size, self._hung(low, low + 0.4), 0.05, [paint], 0.6)
 
-    def _picture(self):  # type: ignore[no-untyped-def]
+    def _picture(self) -> _Hanging:
         size = self.rng.uniform([0.2, 0.2], [1.0, 0.9]) * self.rng.choice([0.6, 1.0, 1.3])
         painter = [self.painter(PICTURES)]
-        return size, self._hung(size[1] + 0.7, 2.4), self.rng.uniform(0.01, 0.05), painter, 0.0
+        deep = self.rng.uniform(0.01, 0.05)
+        return _Hanging(size, self._hung(size[1] + 0.7, 2.4), deep, painter)
 
-    def _wall_shelf(self):  # type: ignore[no-untyped-def]
+    def _wall_shelf(self) -> _Hanging:
         size = self.rng.uniform([0.5, 0.25], [1.4, 1.1])
         deep = self.rng.uniform(0.12, 0.3)
         painter = [books(self.rng, self.palette, 1.0)]
-        return size, self._hung(1.3, 2.3), deep, painter, 0.0
+        return _Hanging(size, self._hung(1.3, 2.3), deep, painter)
 
     # ------------------------------------------------------------ furniture
     def furnish(self) -> None:

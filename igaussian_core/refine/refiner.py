@@ -18,7 +18,8 @@ from igaussian_core.pnp import pose_covariance, solve_pnp
 from igaussian_core.query import Query
 from igaussian_core.refine.alignment import corners, follow
 from igaussian_core.refine.matchers import GuidedKeypoints, PairMatcher, make_pair_matcher
-from igaussian_core.refine.relative import SCALES, solve_relative
+from igaussian_core.refine.relative import solve_relative
+from igaussian_core.refine.scales import SCALES, ImagePair
 from igaussian_core.refine.verify import Evidence, judge
 from igaussian_core.result import Status
 
@@ -54,6 +55,7 @@ class _View:
     image: NDArray[np.uint8]
     gray: Gray
     depth: Image
+    covered: NDArray[np.bool_]
     trusted: NDArray[np.bool_]
     coverage: float
     median_depth: float
@@ -81,6 +83,7 @@ class Refiner:
         self._guided: PairMatcher = self._matcher
         if config.guided_radius_px > 0 and config.matcher == "auto":
             self._guided = GuidedKeypoints(matcher, keypoints, config.guided_radius_px)
+        self._scale = SCALES[config.scale]() if config.solver == "paper" else None
         self._config = config
         self._verify = verify
 
@@ -179,6 +182,7 @@ class Refiner:
                 image=image,
                 gray=normalize_contrast(image),
                 depth=depth,
+                covered=covered,
                 trusted=trusted_depth(depth, alpha, config.min_alpha, config.max_depth_step),
                 coverage=float(covered.mean()),
                 median_depth=float(np.median(depth[covered])) if covered.any() else 0.0,
@@ -192,10 +196,11 @@ class Refiner:
         camera, config = query.camera, self._config
         depth = sample(view.depth, uv_render)
         points = transform_points(T_scene_cam, unproject(camera, uv_render, depth))
-        if config.solver == "paper":
+        if self._scale is not None:
+            pair = ImagePair(camera, query.image, view.image, view.depth, view.covered)
             solution = solve_relative(
                 camera, uv_render, uv_image, depth, T_scene_cam, config.max_sampson_px,
-                config.max_reprojection_px, SCALES[config.scale],
+                config.max_reprojection_px, self._scale(pair),
             )  # fmt: skip
         else:
             solution = solve_pnp(

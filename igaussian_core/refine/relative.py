@@ -138,9 +138,6 @@ def depth_scale(pair: RelativePose, a: Array, b: Array, depth: Array) -> float:
     return float(np.median(depth * inverse_depths(pair.rotation, pair.direction, a, b)))
 
 
-SCALES: dict[str, ScaleEstimator] = {"depth": depth_scale}
-
-
 def bearings(camera: Camera, uv: Pixels) -> Array:
     """Rays [N, 3] with z = 1 of pixels [N, 2]."""
     x = (np.asarray(uv[:, 0], np.float64) - camera.cx) / camera.fx

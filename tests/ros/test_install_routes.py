@@ -131,6 +131,14 @@ def test_the_installed_code_and_files_are_used(installed: Installation) -> None:
         assert Path(line).is_relative_to(installed.prefix), line
 
 
+def test_the_shipped_weights_are_installed(installed: Installation) -> None:
+    code = (
+        "from igaussian_core.refine.scale_vit import WEIGHTS, load_scale_vit; "
+        "load_scale_vit(WEIGHTS); print(WEIGHTS)"
+    )
+    assert Path(installed.ask(code)).is_relative_to(installed.prefix)
+
+
 def test_the_bundled_demo_is_installed(installed: Installation) -> None:
     code = "from igaussian_core.resources import resource; print(resource('bags/demo'))"
     if not (ROOT / "bags" / "demo" / "drive").is_dir():
