@@ -113,6 +113,12 @@ class RefineConfig:
     max_depth_step: float = _option(
         0.1, "relative depth change within 2 px above which a pixel is an edge", 0, 1
     )
+    photometric: str = _option(
+        "polish",
+        "polish: an aligned pose is moved to where brightness agrees as well; off: it is not",
+        choices=("off", "polish"),
+    )
+    photometric_pixels: int = _option(6000, "most pixels that are polished with", 200, 100000)
     covariance_cell_px: float = _option(
         32.0, "side of image cells whose matches count as one in the covariance, since "
         "neighbours share the map's errors; 0: each counts", 0, 1000
