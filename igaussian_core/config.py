@@ -155,6 +155,17 @@ class VerifyConfig:
     max_sigma_deg: float = _option(
         0.7, "largest standard deviation of the pose's rotation, in degrees", 0.01, 90
     )
+    min_agreement: float = _option(
+        0.8, "least mean correlation of image and render in cells around the inliers; -1: any",
+        -1, 1,
+    )  # fmt: skip
+    min_sharpness: float = _option(
+        0.2, "least share of the render's fine detail that the image shows; -10: any", -10, 1
+    )
+    max_prior_shift: float = _option(
+        0.5, "image widths that a pose may lie from the prior's view; beyond, half as many "
+        "inliers again and a quarter more of their share are wanted", 0, 1000,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

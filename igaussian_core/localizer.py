@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Iterator
 
@@ -20,7 +21,7 @@ from igaussian_core.hypothesis import Hypothesis
 from igaussian_core.map_package import Manifest, MapPackage, open_package
 from igaussian_core.query import Query
 from igaussian_core.refine.refiner import Refinement, Refiner
-from igaussian_core.refine.verify import judge
+from igaussian_core.refine.verify import confidence, judge
 from igaussian_core.result import LocalizationResult, Status
 from igaussian_core.timing import StageTimer
 
@@ -97,16 +98,23 @@ class Localizer:
         failure = LocalizationResult(
             Status.NO_HYPOTHESIS, "no place in the map resembles the image", source="landmarks"
         )
+        over = False
         for hypothesis in self._hypotheses(query, prior):
+            if over:
+                failure = _out_of_time(failure, self._config.runtime.budget_ms)
+                break
+            T_scene_prior = None if prior is None else self._T_map_scene.inverse().camera(prior)
             refinement = self._refiner.refine(
-                query, hypothesis.T_scene_cam, near=hypothesis.source == "prior"
+                query, hypothesis.T_scene_cam, hypothesis.source == "prior", T_scene_prior
             )
             result = self._result(hypothesis, refinement)
             if result.ok:
                 return _timed(result, timer)
             if result.inliers >= failure.inliers:
                 failure = result
-            if timer.elapsed_ms() > self._config.runtime.budget_ms:
+            over = timer.elapsed_ms() > self._config.runtime.budget_ms
+            if over and hypothesis.source != "landmarks":  # whose search would take longer still
+                failure = _out_of_time(failure, self._config.runtime.budget_ms)
                 break
         return _timed(failure, timer)
 
@@ -170,6 +178,9 @@ class Localizer:
             inlier_ratio=evidence.ratio,
             residual_px=evidence.residual_px,
             coverage=evidence.coverage,
+            agreement=evidence.agreement,
+            sharpness=evidence.sharpness,
+            confidence=confidence(evidence, self._config.verify),
             matcher=evidence.method,
             source=hypothesis.source,
             T_map_cam_coarse=self._T_map_scene.camera(hypothesis.T_scene_cam),
@@ -214,6 +225,11 @@ def _contrast(image: NDArray[np.uint8]) -> float:
     """Standard deviation of grey levels at low resolution, where noise is no contrast."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return float(np.std(cv2.resize(gray, (64, 48), interpolation=cv2.INTER_AREA)))
+
+
+def _out_of_time(best: LocalizationResult, budget_ms: float) -> LocalizationResult:
+    reason = f"{budget_ms:.0f} ms were over before all places were tried; the best: {best.reason}"
+    return dataclasses.replace(best, status=Status.TIMEOUT, reason=reason)
 
 
 def _timed(result: LocalizationResult, timer: StageTimer) -> LocalizationResult:

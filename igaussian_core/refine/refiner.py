@@ -17,6 +17,7 @@ from igaussian_core.geometry import inverse, pose_error, transform_points
 from igaussian_core.lifting import at_pixels, sample, trusted_depth, unproject
 from igaussian_core.pnp import pose_covariance, reprojection_errors, solve_pnp
 from igaussian_core.query import Query
+from igaussian_core.refine.agreement import agreement, sharpness
 from igaussian_core.refine.alignment import corners, follow
 from igaussian_core.refine.matchers import GuidedKeypoints, PairMatcher, make_pair_matcher
 from igaussian_core.refine.photometric import align_photometric
@@ -32,6 +33,7 @@ RenderFunction = Callable[[Camera, Array], tuple[Image, Image, Image]]
 
 _MIN_COVERAGE = 0.02  # with less there is nothing to match
 _MAX_SUBPIXEL_MOVE_PX = 4.0
+_MAX_COMPARED_MOVE_PX = 3.0  # of a render that still shows what the image does
 _SOFT_PX = 1.0  # sigma that rids brightness of noise and of what the map shows sharper or softer
 _MAX_LOST_INLIERS = 0.05  # share of the matches' inliers that photometric alignment may lose
 _MAX_WORSE_PX = 0.1  # and by how much their median error may grow
@@ -61,6 +63,7 @@ class _View:
     image: NDArray[np.uint8]
     gray: Gray
     depth: Image
+    covered: NDArray[np.bool_]
     trusted: NDArray[np.bool_]
     coverage: float
     median_depth: float
@@ -102,18 +105,24 @@ class Refiner:
         self._config = config
         self._verify = verify
 
-    def refine(self, query: Query, T_scene_cam: Array, near: bool = False) -> Refinement:
+    def refine(
+        self, query: Query, T_scene_cam: Array, near: bool = False, prior: Array | None = None
+    ) -> Refinement:
         """The pose near a hypothesis, by alignment where that convinces, else by descriptors.
 
         Alignment costs a fifth of descriptor matching and is the more exact of the two, but
-        only finds poses a few degrees away. An accepted pose is then polished.
+        only finds poses a few degrees away. A pose that has the matches for it is then polished,
+        and image and render are compared there.
 
         Args:
             near: the hypothesis comes from the last frame; descriptors are compared only near
                 where the render says the points should be.
+            prior: T_scene_cam where the camera was expected, whatever the hypothesis is.
         """
         found = self._found(query, T_scene_cam, near)
-        return self.polish(query, found) if self._status(found).ok else found
+        if not self._status(found).ok:
+            return found
+        return self._compared(query, self.polish(query, found), prior)
 
     def _found(self, query: Query, T_scene_cam: Array, near: bool) -> Refinement:
         aligned = self.align(query, T_scene_cam)
@@ -212,6 +221,30 @@ class Refiner:
         evidence = replace(evidence, inliers=int(inliers.sum()), residual_px=residual_px)
         return replace(found, T_scene_cam=T_scene_cam, evidence=evidence)
 
+    def _compared(self, query: Query, found: Refinement, prior: Array | None) -> Refinement:
+        """With what a comparison of image and render, and of pose and prior, says."""
+        support, T_scene_cam = found.support, found.T_scene_cam
+        assert support is not None and T_scene_cam is not None
+        camera, view = query.camera, support.view
+        moved_px = _motion_px(camera, T_scene_cam, support.T_scene_view, view.median_depth)
+        if moved_px > _MAX_COMPARED_MOVE_PX:
+            view = self._view(query, T_scene_cam)
+        with query.timer("compare"):
+            uv = support.uv_image[support.inliers]
+            grey = query.once("grey", lambda: cv2.cvtColor(query.image, cv2.COLOR_RGB2GRAY))
+            render = np.asarray(cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY), np.uint8)
+            shift = float("nan")
+            if prior is not None:
+                shift_px = _motion_px(camera, T_scene_cam, prior, view.median_depth)
+                shift = shift_px / camera.width
+            evidence = replace(
+                found.evidence,
+                agreement=agreement(grey, render, view.covered, uv),
+                sharpness=sharpness(query.gray, view.gray, view.covered, uv),
+                prior_shift=shift,
+            )
+        return replace(found, evidence=evidence)
+
     def _match_once(
         self, query: Query, matcher: PairMatcher, view: _View, T_scene_cam: Array
     ) -> Refinement:
@@ -243,6 +276,7 @@ class Refiner:
                 image=image,
                 gray=normalize_contrast(image),
                 depth=depth,
+                covered=covered,
                 trusted=trusted_depth(depth, alpha, config.min_alpha, config.max_depth_step),
                 coverage=float(covered.mean()),
                 median_depth=float(np.median(depth[covered])) if covered.any() else 0.0,
