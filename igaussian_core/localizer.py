@@ -167,7 +167,8 @@ class Localizer:
         T_map_cam = covariance = None
         if status.ok and refinement.T_scene_cam is not None:
             T_map_cam = self._T_map_scene.camera(refinement.T_scene_cam)
-            covariance = _covariance_in_map(refinement, self._T_map_scene)
+            scale = self._package.manifest.covariance_scale
+            covariance = _covariance_in_map(refinement, self._T_map_scene, scale)
         return LocalizationResult(
             status=status,
             reason=reason,
@@ -211,14 +212,17 @@ def _matcher_of(package: MapPackage, config: Config) -> Matcher:
     return matcher
 
 
-def _covariance_in_map(refinement: Refinement, T_map_scene: Sim3) -> Array | None:
-    """The scene's covariance in the map's axes and metres."""
+def _covariance_in_map(
+    refinement: Refinement, T_map_scene: Sim3, scale: float
+) -> Array | None:
+    """The scene's covariance in the map's axes and metres, times the map's own factor."""
     if refinement.covariance_scene is None:
         return None
     turn = np.zeros((6, 6))
     turn[:3, :3] = T_map_scene.scale * T_map_scene.rotation
     turn[3:, 3:] = T_map_scene.rotation
-    return np.asarray(turn @ refinement.covariance_scene @ turn.T)
+    covariance = scale * turn @ refinement.covariance_scene @ turn.T
+    return np.asarray(0.5 * (covariance + covariance.T))
 
 
 def _contrast(image: NDArray[np.uint8]) -> float:

@@ -35,6 +35,7 @@ LAYERS = [
     ["coarse", "refine"],
     ["localizer"],
     ["tracker", "replay", "compile_map", "train", "evaluate"],
+    ["calibrate"],
     ["cli_tools"],
     ["cli_eval"],
     ["cli"],
