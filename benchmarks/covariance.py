@@ -6,8 +6,8 @@ with another brightness and noise: they know nothing of the map's own errors, so
 allows for these is too large for them.
 
 A second table calibrates each map as `igaussian map calibrate` does and shows poses that this did
-not see: lego by its 13 held-out training views, redkitchen by every second photo, the bundled drive
-by the other half of it. The other sets have too few photos.
+not see: lego by its 13 held-out training views, redkitchen's photos each by the others, each half
+of the bundled drive by the other half. The other sets have too few photos.
 
     python benchmarks/covariance.py [--work folder] [--renders 20] [--json out.json]
         [--set refine.covariance_inflation=4 ...]
@@ -90,7 +90,7 @@ def main() -> None:
     arguments = parser.parse_args()
     config = load_config(None, arguments.set)
     report, pooled = {}, {"photos": [], "renders": []}
-    halves: dict[str, tuple[Array, Array]] = {}  # NEES to calibrate on, and to test
+    tests: dict[str, Test] = {}
     print("| set | poses | mean NEES | median NEES | inside the 95 % ellipsoid |")
     print("|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as temporary:
@@ -109,22 +109,23 @@ def main() -> None:
                 "photos": PhotoQueries(tuple(photos), localizer.T_map_scene, (red, green, blue)),
                 "renders": RenderQueries(localizer, _views(localizer, folder, size, arguments)),
             }
-            if others:
-                queries = PhotoQueries(
-                    tuple(others), localizer.T_map_scene, (red, green, blue)
-                )
-                apart = run(lambda localizer=localizer: localizer, queries).outcomes
-                halves[name] = (_nees(apart), np.zeros(0))
+            apart = PhotoQueries(tuple(others), localizer.T_map_scene, (red, green, blue))
             for track, queries in tracks.items():
                 outcomes = run(lambda localizer=localizer: localizer, queries).outcomes
                 pooled[track] += outcomes
-                if track == "photos":
-                    halves |= _halves(name, _nees(outcomes), halves.get(name))
+                if track == "photos" and others:
+                    seen = run(lambda localizer=localizer: localizer, apart).outcomes
+                    tests[name] = _apart(_nees(seen), _nees(outcomes))
+                elif track == "photos":
+                    tests[name] = _each_by_the_others(_nees(outcomes))
                 report[f"{name}, {track}"] = _row(f"{name}, {track}", outcomes, 0.05 * size)
     for track, outcomes in pooled.items():
         report[f"all {track}"] = _row(f"all {track}", outcomes, float("inf"))
-    halves |= _halves("drive", _drive(arguments.work, config), None, interleaved=False)
-    report["calibrated"] = _calibrated(halves)
+    drive = _drive(arguments.work, config)
+    first, second = drive[: len(drive) // 2], drive[len(drive) // 2 :]
+    tests["drive, first half"] = _apart(second, first)
+    tests["drive, second half"] = _apart(first, second)
+    report["calibrated"] = _calibrated(tests)
     if arguments.json:
         arguments.json.write_text(json.dumps(report, indent=1))
 
@@ -134,17 +135,28 @@ def _nees(outcomes: list[QueryOutcome]) -> Array:
     return values[np.isfinite(values)]
 
 
-def _halves(
-    name: str, nees: Array, apart: tuple[Array, Array] | None, interleaved: bool = True
-) -> dict[str, tuple[Array, Array]]:
-    """What each test's factor is measured on, and the test's own NEES."""
-    if apart is not None:
-        return {name: (apart[0], nees)}
-    if interleaved:
-        a, b = nees[::2], nees[1::2]
-    else:
-        a, b = nees[: len(nees) // 2], nees[len(nees) // 2 :]
-    return {f"{name}, one half": (b, a), f"{name}, the other": (a, b)}
+@dataclass(frozen=True)
+class Test:
+    """NEES of poses, each with the factor that other poses gave."""
+
+    nees: Array
+    scales: Array
+    calibrated_on: int
+
+
+def _apart(seen: Array, test: Array) -> Test:
+    """Poses judged by a factor that `seen` gave."""
+    scale = covariance_scale(seen) if len(seen) >= MIN_POSES else np.nan
+    return Test(test, np.full(len(test), scale), len(seen))
+
+
+def _each_by_the_others(nees: Array) -> Test:
+    count = len(nees) - 1
+    if count < MIN_POSES:
+        return _apart(nees[:count], nees)
+    return Test(
+        nees, np.array([covariance_scale(np.delete(nees, i)) for i in range(len(nees))]), count
+    )
 
 
 def _drive(work: Path | None, config: Config) -> Array:
@@ -166,21 +178,21 @@ def _drive(work: Path | None, config: Config) -> Array:
     return np.array(found)
 
 
-def _calibrated(halves: dict[str, tuple[Array, Array]]) -> dict[str, object]:
+def _calibrated(tests: dict[str, Test]) -> dict[str, object]:
     print("\n| poses that calibration did not see | poses | mean NEES | inside | calibrated on "
           "| factor | mean NEES | inside |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|")
     report: dict[str, object] = {}
-    for name, (seen, test) in halves.items():
-        before = f"{len(test)} | {test.mean():.1f} | {(test < NEES_95).mean():.1%}"
-        if len(seen) < MIN_POSES:
-            print(f"| {name} | {before} | {len(seen)}: too few | | | |", flush=True)
+    for name, test in tests.items():
+        before = f"{len(test.nees)} | {test.nees.mean():.1f} | {(test.nees < NEES_95).mean():.1%}"
+        report[name] = {"nees": test.nees.tolist(), "scales": test.scales.tolist(),
+                        "calibrated_on": test.calibrated_on}  # fmt: skip
+        if not np.isfinite(test.scales).all():
+            print(f"| {name} | {before} | {test.calibrated_on}: too few | | | |", flush=True)
             continue
-        scale = covariance_scale(seen)
-        after = test / scale
-        print(f"| {name} | {before} | {len(seen)} | {scale:.2f} | {after.mean():.1f} "
-              f"| {(after < NEES_95).mean():.1%} |", flush=True)  # fmt: skip
-        report[name] = {"scale": scale, "seen": seen.tolist(), "test": test.tolist()}
+        after = test.nees / test.scales
+        print(f"| {name} | {before} | {test.calibrated_on} | {np.median(test.scales):.2f} "
+              f"| {after.mean():.1f} | {(after < NEES_95).mean():.1%} |", flush=True)  # fmt: skip
     return report
 
 

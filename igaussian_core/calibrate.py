@@ -22,7 +22,8 @@ from igaussian_core.posed_images import PosedImage
 
 log = logging.getLogger(__name__)
 
-MIN_POSES = 8
+MIN_POSES = 12  # with fewer, one more photo changes the factor by half
+_DEFAULT_POSES = 2  # whose worth the default counts
 _DEGREES_OF_FREEDOM = 6
 _RANGE = (0.05, 100.0)
 _MAX_ERROR_DEG = 5.0  # beyond it a pose is wrong, which no covariance is meant to cover
@@ -62,7 +63,7 @@ def calibrate_map(
             photos that the map was trained on, only the others are used.
 
     Raises:
-        MapError, DatasetError: unusable input, fewer than 8 accepted poses; the manifest is
+        MapError, DatasetError: unusable input, fewer than 12 accepted poses; the manifest is
             left as it was then.
     """
     images, held_out = _photos(photos, map_note)
@@ -80,7 +81,7 @@ def calibrate(
     """As `calibrate_map`, of photos in hand, which are taken to be held out; writes nothing.
 
     Raises:
-        DatasetError: fewer than 8 accepted poses.
+        DatasetError: fewer than 12 accepted poses.
     """
     plain = dataclasses.replace(package.manifest, covariance_scale=1.0)
     localizer = Localizer(dataclasses.replace(package, manifest=plain), config)
@@ -108,15 +109,19 @@ def calibrate(
 
 
 def covariance_scale(nees: ArrayLike) -> float:
-    """The factor [0.05 to 100] that makes the mean of e^T C^-1 e [N] what six numbers have: 6.
+    """The factor [0.05 to 100] that makes e^T C^-1 e [N] what six numbers' should be.
 
-    Where the errors' tail is longer than a normal distribution's, the factor is the one that
-    puts 95 % inside the 95 % ellipsoid instead, if that is the larger.
+    That is a mean of 6, or, where the errors' tail is longer than a normal distribution's, 95 %
+    inside the 95 % ellipsoid: the larger of both. The default, 1, counts as two more poses: few
+    photos tell little, and a covariance too small does more harm than one too large.
     """
     values: NDArray[np.float64] = np.asarray(nees, np.float64)
     by_mean = float(values.mean()) / _DEGREES_OF_FREEDOM
     by_tail = float(np.quantile(values, 0.95)) / NEES_95
-    return float(np.clip(max(by_mean, by_tail), *_RANGE))
+    measured = len(values) * max(by_mean, by_tail)
+    return float(
+        np.clip((measured + _DEFAULT_POSES) / (len(values) + _DEFAULT_POSES), *_RANGE)
+    )
 
 
 def _photos(
