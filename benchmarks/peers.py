@@ -162,9 +162,11 @@ ABLATION = (
            _staged(lambda r, q, T: r.match(q, T), rounds=1)),
     Method("ours: + matching and PnP, two rounds", _staged(lambda r, q, T: r.match(q, T))),
     Method("ours: landmarks + alignment, no matching", _staged(lambda r, q, T: r.align(q, T))),
-    Method("ours: all, alignment in one round",
-           _staged(lambda r, q, T: r.refine(q, T), align_rounds=1)),
-    OURS,
+    Method("ours: all, alignment in one round, no photometric alignment",
+           _staged(lambda r, q, T: r.refine(q, T), align_rounds=1, photometric="off")),
+    Method("ours: all but photometric alignment",
+           _staged(lambda r, q, T: r.refine(q, T), photometric="off")),
+    dataclasses.replace(OURS, name="ours: + photometric alignment"),
 )  # fmt: skip
 
 

@@ -8,11 +8,11 @@ prior as when tracking):
   5 degrees or 5 % of the extent off;
 - the held-out photos themselves, and after changes of exposure, gamma, JPEG, blur: recall.
 
-The ROC moves a threshold on the inliers: the share of images right and accepted with as many,
-against the share of images not right with as many. A refused image has no pose, so one of the map's
-own scene counts as not right.
+The ROC moves a threshold on the result's `confidence`, which the verdict puts at 0.5: the share of
+usable photos that are right with as much, against the share of the other images that are not right
+with as much. A refused image has no pose, so one of the map's own scene counts as not right.
 
-    python benchmarks/verdict.py [--json out.json] [--picture roc.png] [--work folder] [--photos 8]
+    python benchmarks/verdict.py [--json out.json] [--roc roc.png] [--work folder] [--photos 8]
         [--set refine.matcher=xfeat ...]
 """
 
@@ -34,7 +34,6 @@ from photos import CASES, compiled
 from igaussian_core.camera import Camera
 from igaussian_core.cli_tools import load_config
 from igaussian_core.compile_map import training_images
-from igaussian_core.config import Config
 from igaussian_core.evaluate.image_changes import Change
 from igaussian_core.evaluate.photos import extent, held_out_images
 from igaussian_core.geometry import pose_error
@@ -79,12 +78,16 @@ class Answer:
     right: bool
     inliers: int
     matcher: str
+    status: str
+    confidence: float
+    agreement: float
+    sharpness: float
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--roc", type=Path, help="picture of the ROC")
     parser.add_argument("--work", type=Path)
     parser.add_argument("--photos", type=int, default=8, help="most photos of each set")
     parser.add_argument("--set", action="append", default=[], help="configuration, e.g. a.b=1")
@@ -105,8 +108,8 @@ def main() -> None:
     _print_tables(answers)
     if arguments.json:
         arguments.json.write_text(json.dumps([asdict(a) for a in answers], indent=1))
-    if arguments.picture:
-        _draw(answers, config, arguments.picture)
+    if arguments.roc:
+        _draw(answers, arguments.roc)
 
 
 def _cases(localizer: Localizer, folder: Path, prefix: str, count: int) -> Iterator[Case]:
@@ -172,18 +175,23 @@ def _answer(localizer: Localizer, map_name: str, case: Case, size: float) -> Ans
     if result.T_map_cam is not None and case.T_map_cam is not None:
         angle, distance = pose_error(result.T_map_cam, case.T_map_cam)
         right = angle < 5 and distance < 0.05 * size
-    return Answer(map_name, case.kind, result.ok, right, result.inliers, result.matcher)
+    return Answer(
+        map_name, case.kind, result.ok, right, result.inliers, result.matcher,
+        result.status.value, result.confidence, result.agreement, result.sharpness,
+    )  # fmt: skip
 
 
 def _print_tables(answers: list[Answer]) -> None:
-    print("\n| image | images | accepted | right | wrong, accepted | most inliers of a wrong one |")
+    print("\n| image | images | accepted | right | wrong, accepted | most inliers, confidence "
+          "of a wrong one |")
     print("|---|---|---|---|---|---|")
     for kind in dict.fromkeys(a.kind for a in answers):
         some = [a for a in answers if a.kind == kind]
         accepted, right = [a for a in some if a.accepted], sum(a.right for a in some)
         most = max((a.inliers for a in some if not a.right), default=0)
+        sure = max((a.confidence for a in some if not a.right), default=0.0)
         print(f"| {kind} | {len(some)} | {len(accepted)} | {right} ({right / len(some):.1%}) "
-              f"| {len(accepted) - right} | {most} |")  # fmt: skip
+              f"| {len(accepted) - right} | {most}, {sure:.2f} |")  # fmt: skip
     wrong = sum(a.accepted and not a.right for a in answers)
     kinds = [a for a in answers if a.kind in HARMLESS]
     recall = sum(a.right for a in kinds) / len(kinds)
@@ -191,8 +199,8 @@ def _print_tables(answers: list[Answer]) -> None:
           f"recall over {len(kinds)} usable photos {recall:.1%}")  # fmt: skip
 
 
-def _draw(answers: list[Answer], config: Config, path: Path) -> None:
-    """ROC by the threshold on inliers, each threshold used marked."""
+def _draw(answers: list[Answer], path: Path) -> None:
+    """ROC by the threshold on confidence, the verdict's marked."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -200,20 +208,32 @@ def _draw(answers: list[Answer], config: Config, path: Path) -> None:
 
     # of what must be accepted, the right ones; and what is not right, whatever it shows
     usable = [a for a in answers if a.kind in HARMLESS]
-    wrong = np.array([a.inliers for a in answers if not a.right and a.kind not in HARMLESS])
-    right = np.array([a.inliers for a in usable if a.right])
-    thresholds = np.arange(0, max(right.max(), wrong.max()) + 2)
+    right = np.array([a.confidence for a in usable if a.right])
+    others = [a for a in answers if a.kind not in HARMLESS and not a.right]
+    kinds = dict.fromkeys(a.kind.removesuffix(", prior") for a in others)
+    thresholds = np.linspace(0, 1, 1001)
     recall = np.array([(right >= t).sum() / len(usable) for t in thresholds])
+    wrong = np.array([a.confidence for a in others])
     false = np.array([(wrong >= t).mean() for t in thresholds])
-    figure, axes = plt.subplots(figsize=(6, 4.5))
-    axes.step(false, recall, where="post")
-    least = config.verify.min_inliers_align
-    axes.plot(false[least], recall[least], "o", label=f"{least} inliers, the default")
-    axes.set_xlabel("share of images without a right pose that have as many inliers")
-    axes.set_ylabel("recall")
-    axes.set_title(f"{len(usable)} usable photos, {len(wrong)} others, {len(MAPS)} maps")
-    axes.grid(alpha=0.3)
-    axes.legend()
+    at = int(np.searchsorted(thresholds, 0.5))
+    figure, (left, axes) = plt.subplots(1, 2, figsize=(11, 4.5))
+    left.step(false, recall, where="post")
+    left.plot(false[at], recall[at], "o", label="confidence 0.5, the verdict")
+    left.set(xlabel="share of the other images not right with as much confidence",
+             ylabel="recall", ylim=(-0.02, 1.02))  # fmt: skip
+    left.set_title(f"{len(usable)} usable photos, {len(wrong)} others, {len(MAPS)} maps")
+    left.legend(loc="lower right")
+    bins = np.linspace(0, 1, 41)
+    axes.hist(right, bins, alpha=0.6, label="usable photos, right")
+    axes.hist(
+        [[a.confidence for a in others if a.kind.removesuffix(", prior") == k] for k in kinds],
+        bins, stacked=True, alpha=0.8, label=[f"{k}, not right" for k in kinds],
+    )  # fmt: skip
+    axes.axvline(0.5, color="black", linestyle="--")
+    axes.set(xlabel="confidence", ylabel="images", yscale="log")
+    axes.legend(fontsize=7, loc="upper center")
+    for part in (left, axes):
+        part.grid(alpha=0.3)
     figure.tight_layout()
     figure.savefig(path, dpi=120)
 

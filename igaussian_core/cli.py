@@ -170,6 +170,8 @@ def _describe(path: Path) -> dict[str, str]:
         "landmarks": f"{len(package.landmarks.points):,} ({m.matcher})",
         **network,
         "scale, map / scene": f"{package.T_map_scene.scale:.6g}",
+        "covariance": f"times {m.covariance_scale:.3g}, measured on {m.covariance_poses} photos"
+        if m.covariance_poses else "not calibrated",
         "size on disk": f"{_megabytes(path):.1f} MB",
         **summarize(package.gaussians),
     }
@@ -275,6 +277,31 @@ def map_align(
         T_map_scene = Sim3(scale, rotation, -scale * rotation @ np.array(point or (0.0,) * 3))
     manifest = with_T_map_scene(path, T_map_scene)
     console.print(f"{path}: T_map_scene = {json.dumps(manifest.T_map_scene)}")
+
+
+@map_app.command("calibrate")
+def map_calibrate(
+    path: Annotated[Path, typer.Argument(help="compiled map directory")],
+    photos: Annotated[Path, typer.Option(help="photos with poses, as for map compile")],
+    map_json: Annotated[
+        Path | None, typer.Option(help="names the photos trained on; default: beside the photos")
+    ] = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+) -> None:
+    """Scale the covariance by what photos with poses show; held-out ones where map.json tells."""
+    from igaussian_core.calibrate import calibrate_map
+
+    with progress_bars() as progress:
+        found = calibrate_map(
+            path, photos, map_json, load_config(config, set_), Stages(progress)
+        )
+    kind = "held out" if found.held_out else "perhaps trained on: the covariance may be too small"
+    console.print(
+        f"{path}: covariance times {found.scale:.3g}, measured on {found.poses} of "
+        f"{found.photos} photos ({kind}); before, the mean NEES was {found.mean_nees:.1f} and "
+        f"{found.inside_95:.0%} of the errors were inside the 95 % ellipsoid"
+    )
 
 
 def _megabytes(path: Path) -> float:

@@ -123,6 +123,12 @@ class RefineConfig:
     max_depth_step: float = _option(
         0.1, "relative depth change within 2 px above which a pixel is an edge", 0, 1
     )
+    photometric: str = _option(
+        "polish",
+        "polish: an aligned pose is moved to where brightness agrees as well; off: it is not",
+        choices=("off", "polish"),
+    )
+    photometric_pixels: int = _option(6000, "most pixels that are polished with", 200, 100000)
     covariance_cell_px: float = _option(
         32.0, "side of image cells whose matches count as one in the covariance, since "
         "neighbours share the map's errors; 0: each counts", 0, 1000
@@ -159,6 +165,17 @@ class VerifyConfig:
     max_sigma_deg: float = _option(
         0.7, "largest standard deviation of the pose's rotation, in degrees", 0.01, 90
     )
+    min_agreement: float = _option(
+        0.8, "least mean correlation of image and render in cells around the inliers; -1: any",
+        -1, 1,
+    )  # fmt: skip
+    min_sharpness: float = _option(
+        0.2, "least share of the render's fine detail that the image shows; -10: any", -10, 1
+    )
+    max_prior_shift: float = _option(
+        0.5, "image widths that a pose may lie from the prior's view; beyond, half as many "
+        "inliers again and a quarter more of their share are wanted", 0, 1000,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Iterator
 
@@ -21,7 +22,7 @@ from igaussian_core.hypothesis import Hypothesis
 from igaussian_core.map_package import Manifest, MapPackage, open_package
 from igaussian_core.query import Query
 from igaussian_core.refine.refiner import Refinement, Refiner
-from igaussian_core.refine.verify import judge
+from igaussian_core.refine.verify import confidence, judge
 from igaussian_core.result import LocalizationResult, Status
 from igaussian_core.timing import StageTimer
 
@@ -99,14 +100,20 @@ class Localizer:
         failure = LocalizationResult(
             Status.NO_HYPOTHESIS, "no place in the map resembles the image", source="landmarks"
         )
+        over = False
         for hypothesis in self._hypotheses(query, prior):
-            refinement = self._refine(query, hypothesis)
+            if over:
+                failure = _out_of_time(failure, self._config.runtime.budget_ms)
+                break
+            refinement = self._refine(query, hypothesis, prior)
             result = self._result(hypothesis, refinement)
             if result.ok:
                 return _timed(result, timer)
             if result.inliers >= failure.inliers:
                 failure = result
-            if timer.elapsed_ms() > self._config.runtime.budget_ms:
+            over = timer.elapsed_ms() > self._config.runtime.budget_ms
+            if over and hypothesis.source != "landmarks":  # whose search would take longer still
+                failure = _out_of_time(failure, self._config.runtime.budget_ms)
                 break
         return _timed(failure, timer)
 
@@ -156,13 +163,19 @@ class Localizer:
                 query, self._landmarks.hypotheses(query.features, query.camera)
             )
 
-    def _refine(self, query: Query, hypothesis: Hypothesis) -> Refinement:
+    def _refine(
+        self, query: Query, hypothesis: Hypothesis, prior: ArrayLike | None
+    ) -> Refinement:
         """Stage two. What the network says is only aligned in the cascade: where that does not
         convince, the landmarks cost less than matching descriptors at a wrong place."""
-        if hypothesis.source == "network" and self._config.coarse.method == "cascade":
-            return self._refiner.align(query, hypothesis.T_scene_cam)
-        near = hypothesis.source == "prior"
-        return self._refiner.refine(query, hypothesis.T_scene_cam, near=near)
+        from_network = hypothesis.source == "network"
+        return self._refiner.refine(
+            query,
+            hypothesis.T_scene_cam,
+            near=hypothesis.source == "prior",
+            prior=None if prior is None else self._T_map_scene.inverse().camera(prior),
+            describe=not (from_network and self._config.coarse.method == "cascade"),
+        )
 
     def _result(self, hypothesis: Hypothesis, refinement: Refinement) -> LocalizationResult:
         evidence = refinement.evidence
@@ -170,7 +183,8 @@ class Localizer:
         T_map_cam = covariance = None
         if status.ok and refinement.T_scene_cam is not None:
             T_map_cam = self._T_map_scene.camera(refinement.T_scene_cam)
-            covariance = _covariance_in_map(refinement, self._T_map_scene)
+            scale = self._package.manifest.covariance_scale
+            covariance = _covariance_in_map(refinement, self._T_map_scene, scale)
         return LocalizationResult(
             status=status,
             reason=reason,
@@ -181,6 +195,9 @@ class Localizer:
             inlier_ratio=evidence.ratio,
             residual_px=evidence.residual_px,
             coverage=evidence.coverage,
+            agreement=evidence.agreement,
+            sharpness=evidence.sharpness,
+            confidence=confidence(evidence, self._config.verify),
             matcher=evidence.method,
             source=hypothesis.source,
             T_map_cam_coarse=self._T_map_scene.camera(hypothesis.T_scene_cam),
@@ -237,20 +254,28 @@ def _timed_each(query: Query, candidates: Iterator[Hypothesis]) -> Iterator[Hypo
         yield hypothesis
 
 
-def _covariance_in_map(refinement: Refinement, T_map_scene: Sim3) -> Array | None:
-    """The scene's covariance in the map's axes and metres."""
+def _covariance_in_map(
+    refinement: Refinement, T_map_scene: Sim3, scale: float
+) -> Array | None:
+    """The scene's covariance in the map's axes and metres, times the map's own factor."""
     if refinement.covariance_scene is None:
         return None
     turn = np.zeros((6, 6))
     turn[:3, :3] = T_map_scene.scale * T_map_scene.rotation
     turn[3:, 3:] = T_map_scene.rotation
-    return np.asarray(turn @ refinement.covariance_scene @ turn.T)
+    covariance = scale * turn @ refinement.covariance_scene @ turn.T
+    return np.asarray(0.5 * (covariance + covariance.T))
 
 
 def _contrast(image: NDArray[np.uint8]) -> float:
     """Standard deviation of grey levels at low resolution, where noise is no contrast."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return float(np.std(cv2.resize(gray, (64, 48), interpolation=cv2.INTER_AREA)))
+
+
+def _out_of_time(best: LocalizationResult, budget_ms: float) -> LocalizationResult:
+    reason = f"{budget_ms:.0f} ms were over before all places were tried; the best: {best.reason}"
+    return dataclasses.replace(best, status=Status.TIMEOUT, reason=reason)
 
 
 def _timed(result: LocalizationResult, timer: StageTimer) -> LocalizationResult:

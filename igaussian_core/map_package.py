@@ -55,6 +55,8 @@ class Manifest:
         background: RGB in [0, 1] that lies behind the Gaussians.
         source_file, source_sha256: the file that was compiled.
         gaussians_sha256: of the copy inside the package.
+        covariance_scale: what the covariance of a pose is multiplied by in this map.
+        covariance_poses: on how many that was measured; 0: not at all.
     """
 
     name: str
@@ -69,6 +71,8 @@ class Manifest:
     gaussians_sha256: str
     format: str = FORMAT
     version: int = VERSION
+    covariance_scale: float = 1.0
+    covariance_poses: int = 0
 
 
 @dataclass(frozen=True)
@@ -220,6 +224,22 @@ def with_network(path: str | os.PathLike[str], network: NetworkData) -> None:
     _write_network(network, folder)
 
 
+def with_covariance_scale(path: str | os.PathLike[str], scale: float, poses: int) -> Manifest:
+    """Give a compiled map another `covariance_scale`, measured on so many poses.
+
+    Raises:
+        MapError: no compiled map, or a scale that is not positive.
+    """
+    folder = Path(path)
+    if not 0 < scale < np.inf:
+        raise MapError(f"{folder}: covariance_scale {scale} is not positive; it is left as it was")
+    manifest = dataclasses.replace(
+        _read_manifest(folder), covariance_scale=float(scale), covariance_poses=int(poses)
+    )
+    _write_manifest(manifest, folder)
+    return manifest
+
+
 def _write(package: MapPackage, folder: Path) -> None:
     landmarks = package.landmarks
     save_ply(package.gaussians, folder / _GAUSSIANS)
@@ -313,6 +333,8 @@ def _check_values(manifest: Manifest) -> None:
         values = np.asarray(getattr(manifest, name), np.float64)
         if values.shape != shape or not np.isfinite(values).all():
             raise ValueError(f"{name} is not {shape or 'one'} finite numbers")
+    if not 0 < float(manifest.covariance_scale) < np.inf:
+        raise ValueError("covariance_scale is not positive")
 
 
 def _read_landmarks(file: Path) -> Landmarks:

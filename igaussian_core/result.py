@@ -18,7 +18,8 @@ class Status(str, Enum):
     TOO_FEW_MATCHES = "too_few_matches"  # image and render at the hypothesis do not match
     INCONSISTENT = "inconsistent"  # matches that do not agree on one pose
     OUT_OF_MAP = "out_of_map"  # the map covers too little of the view
-    TOO_DARK_OR_BLURRED = "too_dark_or_blurred"  # the image holds no structure
+    TOO_DARK_OR_BLURRED = "too_dark_or_blurred"  # no structure, or far less than the map shows
+    TIMEOUT = "timeout"  # the budget ended before every hypothesis was tried
 
     @property
     def ok(self) -> bool:
@@ -38,6 +39,11 @@ class LocalizationResult:
         inlier_ratio: inliers / matches.
         residual_px: median reprojection error of the inliers in pixels.
         coverage: share of the render's pixels that the map covers.
+        agreement: correlation of image and render around the inliers, at most 1; NaN where
+            the matches told enough already, or too little could be compared.
+        sharpness: share of the render's fine detail that the image shows; NaN likewise.
+        confidence: how far the evidence is from the thresholds, 0 to 1; a pose is accepted
+            above 0.5 (`refine/verify.py`). No probability.
         matcher: what the deciding correspondences came from: "align", "xfeat", "sift".
         source: where the accepted (or last tried) hypothesis came from.
         T_map_cam_coarse: the best hypothesis before refinement, or None.
@@ -53,6 +59,9 @@ class LocalizationResult:
     inlier_ratio: float = 0.0
     residual_px: float = float("nan")
     coverage: float = float("nan")
+    agreement: float = float("nan")
+    sharpness: float = float("nan")
+    confidence: float = 0.0
     matcher: str = ""
     source: str = ""
     T_map_cam_coarse: NDArray[np.float64] | None = None

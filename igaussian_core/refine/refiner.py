@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,10 +15,12 @@ from igaussian_core.contrast import Gray, normalize_contrast
 from igaussian_core.features import Matcher
 from igaussian_core.geometry import inverse, pose_error, transform_points
 from igaussian_core.lifting import at_pixels, sample, trusted_depth, unproject
-from igaussian_core.pnp import pose_covariance, solve_pnp
+from igaussian_core.pnp import pose_covariance, reprojection_errors, solve_pnp
 from igaussian_core.query import Query
+from igaussian_core.refine.agreement import agreement, sharpness
 from igaussian_core.refine.alignment import corners, follow
 from igaussian_core.refine.matchers import GuidedKeypoints, PairMatcher, make_pair_matcher
+from igaussian_core.refine.photometric import align_photometric
 from igaussian_core.refine.relative import solve_relative
 from igaussian_core.refine.scales import SCALES, ImagePair
 from igaussian_core.refine.verify import Evidence, judge
@@ -31,6 +34,10 @@ RenderFunction = Callable[[Camera, Array], tuple[Image, Image, Image]]
 
 _MIN_COVERAGE = 0.02  # with less there is nothing to match
 _MAX_SUBPIXEL_MOVE_PX = 4.0
+_MAX_COMPARED_MOVE_PX = 3.0  # of a render that still shows what the image does
+_SOFT_PX = 1.0  # sigma that rids brightness of noise and of what the map shows sharper or softer
+_MAX_LOST_INLIERS = 0.05  # share of the matches' inliers that photometric alignment may lose
+_MAX_WORSE_PX = 0.1  # and by how much their median error may grow
 
 
 @dataclass(frozen=True)
@@ -41,11 +48,13 @@ class Refinement:
         T_scene_cam: the refined pose; None where no pose fits the correspondences.
         covariance_scene: [6, 6], scene axes and units; None with the pose.
         evidence: what the verdict rests on.
+        support: the render and the matches of the last solve; None with the pose.
     """
 
     T_scene_cam: Array | None
     covariance_scene: Array | None
     evidence: Evidence
+    support: _Support | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -59,6 +68,17 @@ class _View:
     trusted: NDArray[np.bool_]
     coverage: float
     median_depth: float
+
+
+@dataclass(frozen=True)
+class _Support:
+    """What a solved pose rests on: a render, and the image's pixels of the points it shows."""
+
+    view: _View
+    T_scene_view: Array
+    uv_image: Pixels
+    points_scene: Array
+    inliers: NDArray[np.bool_]
 
 
 class Refiner:
@@ -87,18 +107,32 @@ class Refiner:
         self._config = config
         self._verify = verify
 
-    def refine(self, query: Query, T_scene_cam: Array, near: bool = False) -> Refinement:
+    def refine(
+        self, query: Query, T_scene_cam: Array, near: bool = False, prior: Array | None = None,
+        describe: bool = True,
+    ) -> Refinement:  # fmt: skip
         """The pose near a hypothesis, by alignment where that convinces, else by descriptors.
 
         Alignment costs a fifth of descriptor matching and is the more exact of the two, but
-        only finds poses a few degrees away.
+        only finds poses a few degrees away. A pose that has the matches for it is then polished,
+        and image and render are compared there.
 
         Args:
             near: the hypothesis comes from the last frame; descriptors are compared only near
                 where the render says the points should be.
+            prior: T_scene_cam where the camera was expected, whatever the hypothesis is.
+            describe: match descriptors where alignment does not convince.
         """
+        found = self._found(query, T_scene_cam, near, describe)
+        if not self._status(found).ok:
+            return found
+        return self._compared(query, self.polish(query, found), prior)
+
+    def _found(
+        self, query: Query, T_scene_cam: Array, near: bool, describe: bool
+    ) -> Refinement:
         aligned = self.align(query, T_scene_cam)
-        if self._status(aligned) is Status.OK:
+        if self._status(aligned) is Status.OK or not describe:
             return aligned
         matched = self.match(query, T_scene_cam, near)
         if matched.T_scene_cam is None or not self._status(matched).ok:
@@ -150,6 +184,72 @@ class Refiner:
                 break
         assert best is not None
         return best
+
+    def polish(self, query: Query, found: Refinement) -> Refinement:
+        """An aligned pose moved to where the image's and the render's brightness agree as well.
+
+        Points and pixels weigh alike. What was found stays where brightness would not agree
+        better, or where the points would agree worse.
+        """
+        config, support, T_scene_cam = self._config, found.support, found.T_scene_cam
+        if (
+            config.photometric == "off" or config.solver != "pnp" or support is None
+            or T_scene_cam is None or found.covariance_scene is None
+            or found.evidence.method != "align"
+        ):  # fmt: skip
+            return found
+        view, to_view = support.view, inverse(support.T_scene_view)
+        turn = np.kron(np.eye(2), to_view[:3, :3])
+        with query.timer("polish"):
+            moved = align_photometric(
+                query.once("soft", lambda: _soft(query.gray)), _soft(view.gray), view.depth,
+                view.trusted, query.camera, to_view @ T_scene_cam,
+                turn @ found.covariance_scene @ turn.T, pixels=config.photometric_pixels,
+            )  # fmt: skip
+        if moved is None or not moved.lowered:
+            return found
+        return self._unless_worse(query, found, support.T_scene_view @ moved.T_render_cam)
+
+    def _unless_worse(self, query: Query, found: Refinement, T_scene_cam: Array) -> Refinement:
+        """The refinement at another pose, where its own points speak for that hardly less."""
+        support, evidence = found.support, found.evidence
+        assert support is not None
+        errors = reprojection_errors(
+            query.camera, T_scene_cam, support.uv_image, support.points_scene
+        )
+        inliers = errors < self._config.max_reprojection_px
+        residual_px = float(np.median(errors[support.inliers]))
+        if (
+            inliers.sum() < (1 - _MAX_LOST_INLIERS) * evidence.inliers
+            or residual_px > evidence.residual_px + _MAX_WORSE_PX
+        ):
+            return found
+        evidence = replace(evidence, inliers=int(inliers.sum()), residual_px=residual_px)
+        return replace(found, T_scene_cam=T_scene_cam, evidence=evidence)
+
+    def _compared(self, query: Query, found: Refinement, prior: Array | None) -> Refinement:
+        """With what a comparison of image and render, and of pose and prior, says."""
+        support, T_scene_cam = found.support, found.T_scene_cam
+        assert support is not None and T_scene_cam is not None
+        camera, view = query.camera, support.view
+        moved_px = _motion_px(camera, T_scene_cam, support.T_scene_view, view.median_depth)
+        if moved_px > _MAX_COMPARED_MOVE_PX:
+            view = self._view(query, T_scene_cam)
+        with query.timer("compare"):
+            uv = support.uv_image[support.inliers]
+            grey = query.once("grey", lambda: cv2.cvtColor(query.image, cv2.COLOR_RGB2GRAY))
+            render = np.asarray(cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY), np.uint8)
+            shift = float("nan")
+            if prior is not None:
+                shift_px = _motion_px(camera, T_scene_cam, prior, view.median_depth)
+                shift = shift_px / camera.width
+            evidence = replace(
+                found.evidence,
+                agreement=agreement(grey, render, view.covered, uv),
+                sharpness=sharpness(query.gray, view.gray, view.covered, uv),
+                prior_shift=shift,
+            )
+        return replace(found, evidence=evidence)
 
     def _match_once(
         self, query: Query, matcher: PairMatcher, view: _View, T_scene_cam: Array
@@ -223,7 +323,8 @@ class Refiner:
             spread=_spread(uv_image[inliers], camera),
             sigma_deg=float(np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))),
         )
-        return Refinement(solution.T_scene_cam, covariance, evidence)
+        support = _Support(view, T_scene_cam, uv_image, points, inliers)
+        return Refinement(solution.T_scene_cam, covariance, evidence, support)
 
     def _calibrated(self, covariance: Array, median_depth: float) -> Array:
         """The covariance with what the matches' scatter cannot show: the map's own errors."""
@@ -240,6 +341,10 @@ class Refiner:
 def to_u8(rgb: Image) -> NDArray[np.uint8]:
     """uint8 image of a render in [0, 1]."""
     return np.asarray(np.clip(rgb * 255 + 0.5, 0, 255), np.uint8)
+
+
+def _soft(gray: Gray) -> Image:
+    return np.asarray(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), _SOFT_PX))
 
 
 def _motion_px(camera: Camera, T_a: Array, T_b: Array, median_depth: float) -> float:

@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import room as rooms  # noqa: E402
 
 from igaussian_core.compile_map import CompileOptions, compile_map  # noqa: E402
+from igaussian_core.config import Config  # noqa: E402
 from igaussian_core.gaussian_map import GaussianMap, save_ply  # noqa: E402
 from igaussian_core.localizer import Localizer  # noqa: E402
 
@@ -54,5 +55,5 @@ def room_igmap(room_ply: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def localizer(room_igmap: Path) -> Localizer:
-    """A localizer in the room."""
-    return Localizer.open(room_igmap)
+    """A localizer in the room, whatever else the machine does meanwhile."""
+    return Localizer.open(room_igmap, Config.from_flat({"runtime.budget_ms": 60000.0}))

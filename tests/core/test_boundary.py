@@ -35,6 +35,7 @@ LAYERS = [
     ["coarse", "refine"],
     ["localizer"],
     ["tracker", "replay", "training", "train_scale", "compile_map", "evaluate"],
+    ["calibrate"],
     ["cli_tools"],
     ["cli_eval", "cli_train_scale"],
     ["cli_train"],

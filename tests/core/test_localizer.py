@@ -188,6 +188,49 @@ def test_another_scene_is_not_accepted(localizer: Localizer) -> None:
             assert not result.ok and result.T_map_cam is None
 
 
+def test_a_mirror_image_is_not_accepted(localizer: Localizer, room_map: GaussianMap) -> None:
+    for T in QUERIES[:2]:
+        mirrored = np.ascontiguousarray(room.photo(room_map, T)[:, ::-1])
+        assert not localizer.localize(mirrored, room.CAMERA, T).ok
+
+
+def test_blur_is_named(localizer: Localizer, room_map: GaussianMap) -> None:
+    """Points can still be followed when the detail is gone that a pose should rest on."""
+    image = room.photo(room_map, QUERIES[0])
+    found = {
+        sigma: localizer.localize(
+            np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.uint8), room.CAMERA, QUERIES[0]
+        )
+        for sigma in (3, 7, 14)
+    }
+    assert_right(found[3], QUERIES[0], degrees=0.3, metres=0.01)
+    assert found[7].status is Status.TOO_DARK_OR_BLURRED and "detail" in found[7].reason
+    assert found[7].T_map_cam is None and found[7].inliers > 60
+    assert not found[14].ok
+
+
+def test_confidence_says_what_the_verdict_says(
+    localizer: Localizer, room_map: GaussianMap, results: list[LocalizationResult]
+) -> None:
+    wrong = [localizer.localize(image, room.CAMERA) for image in NOT_THE_ROOM.values()]
+    for result in [*results, *wrong]:
+        assert (result.confidence >= 0.5) is result.ok
+    for result in results:
+        assert result.agreement > 0.9 and result.sharpness > 0.7
+
+
+def test_time_that_is_over_is_told(room_igmap: Path, room_map: GaussianMap) -> None:
+    """The first place is always tried; that others were not is a status of its own."""
+    hurried = Localizer.open(room_igmap, Config.from_flat({"runtime.budget_ms": 1}))
+    image = room.photo(room_map, QUERIES[0])
+    assert_right(hurried.localize(image, room.CAMERA, QUERIES[0] @ NUDGE), QUERIES[0])
+    away = QUERIES[0] @ compose(rotation_from_vector([0, np.pi, 0]), [0, 0, 0])
+    result = hurried.localize(image, room.CAMERA, away)
+    assert result.status is Status.TIMEOUT and not result.ok and result.T_map_cam is None
+    assert "1 ms" in result.reason and "the best" in result.reason
+    assert "coarse" not in result.timings_ms  # no time was spent to find that out
+
+
 @pytest.mark.parametrize("size", [(319, 240), (240, 320), (640, 480)])
 def test_an_image_of_another_size_is_an_error(localizer: Localizer, size: tuple[int, int]) -> None:
     image = np.zeros((size[1], size[0], 3), np.uint8)

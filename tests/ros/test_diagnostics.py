@@ -62,14 +62,16 @@ def test_counters_know_every_outcome():
 def test_the_status_of_a_frame(status, level):
     result = LocalizationResult(
         status, "because", inliers=80, matches=100, inlier_ratio=0.8, residual_px=0.7,
-        coverage=0.9, matcher="xfeat", source="prior", timings_ms={"match": 12.34, "total": 50},
+        coverage=0.9, agreement=0.97, sharpness=0.85, confidence=0.91, matcher="xfeat",
+        source="prior", timings_ms={"match": 12.34, "total": 50},
     )  # fmt: skip
     message = diagnostics.frame_status(header(1234, "map"), "localizer: frame", result, 61.0)
     assert message.header.stamp.nanosec == 1234
     assert message.status[0].level == level
     assert _values(message) == {
         "status": status.value, "reason": "because", "inliers": "80", "matches": "100",
-        "ratio": "0.8000", "residual_px": "0.7000", "coverage": "0.9000", "matcher": "xfeat",
+        "ratio": "0.8000", "residual_px": "0.7000", "coverage": "0.9000",
+        "agreement": "0.9700", "sharpness": "0.8500", "confidence": "0.9100", "matcher": "xfeat",
         "source": "prior", "latency_ms": "61.0", "timing.match_ms": "12.3",
         "timing.total_ms": "50.0",
     }  # fmt: skip
