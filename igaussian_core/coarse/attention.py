@@ -84,6 +84,8 @@ class Prediction(NamedTuple):
         candidate_positions: [B, N, 3].
         log_weights: [B, N], logarithms of weights that sum to one.
         points: [B, h, w, 3] scene coordinates of the cells' centres.
+        resemblance: [B, h * w, N * h' * w'] log softmax of the comparison of the image's cells
+            with all of the source views'; None without `lookup`.
     """
 
     rotation: Tensor
@@ -92,6 +94,7 @@ class Prediction(NamedTuple):
     candidate_positions: Tensor
     log_weights: Tensor
     points: Tensor
+    resemblance: Tensor | None
 
 
 class PoseNetwork(nn.Module):
@@ -113,7 +116,7 @@ class PoseNetwork(nn.Module):
             self.compare_target = nn.Linear(channels, _LOOKUP)
             self.compare_source = nn.Linear(channels, _LOOKUP)
             self.log_sharpness = nn.Parameter(torch.tensor(2.5))
-            self.places = _mlp(3 + 3, 128, width)
+            self.places = _mlp(3 + 2, 128, width)
         self.cells = _Residual(width)
         self.points = nn.Linear(channels, 3)
         self.moved = _mlp(width, 128, 3)
@@ -144,9 +147,9 @@ class PoseNetwork(nn.Module):
         batch, _, height, width = features.shape
         rays = _repeated(self.rays(rays).flatten(1, 2), batch)
         cells = self.target_cells(_flat(features)) + rays
-        seen = torch.zeros(batch, height * width, 3)
+        seen, resemblance = torch.zeros(batch, height * width, 3), None
         if self.config.lookup:
-            seen, evidence = self._look_up(features, views)
+            seen, evidence, resemblance = self._look_up(features, views)
             cells = cells + self.places(torch.cat([seen, evidence], -1))
         cells = self.cells(cells)
         points = seen + self.points(_flat(features)).float() + self.moved(cells).float()
@@ -166,10 +169,14 @@ class PoseNetwork(nn.Module):
             candidate_positions=positions,
             log_weights=log_weights,
             points=points,
+            resemblance=resemblance,
         )
 
-    def _look_up(self, features: Tensor, views: SourceViews) -> tuple[Tensor, Tensor]:
-        """Where in the scene the target's cells probably are: [B, U, 3], and evidence [B, U, 3].
+    def _look_up(
+        self, features: Tensor, views: SourceViews
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Where in the scene the target's cells probably are: [B, U, 3], evidence [B, U, 2], and
+        the resemblance [B, U, N * h * w] that says so.
 
         Attention of every cell of the target over all cells of all source views; the values
         are scene coordinates.
@@ -181,16 +188,23 @@ class PoseNetwork(nn.Module):
         # what all cells of a map share tells none from another
         common = theirs.mean(1, keepdim=True)
         ours, theirs = F.normalize(ours - common, dim=-1), F.normalize(theirs - common, dim=-1)
-        scores = self.log_sharpness.exp() * (ours @ theirs.transpose(1, 2))
-        known = views.known.reshape(maps, 1, -1)
-        share = torch.softmax(scores.masked_fill(~known, -1e4), -1)
-        points = views.points.reshape(maps, -1, 3)
-        mean = share @ points
-        variance = (share @ points.square() - mean.square()).clamp(min=0).sum(-1, keepdim=True)
-        peak = share.amax(-1, keepdim=True)
-        best = scores.amax(-1, keepdim=True) / self.log_sharpness.exp()
-        evidence = torch.cat([variance.add(1e-6).sqrt(), peak, best], -1)
-        return mean.reshape(batch, -1, 3), evidence.reshape(batch, -1, 3)
+        # cells that show nothing are ruled out by one more dimension: cheaper than a mask
+        ours = torch.cat([self.log_sharpness.exp() * ours, torch.ones_like(ours[..., :1])], -1)
+        unknown = -1e4 * (~views.known.reshape(maps, -1, 1)).float()
+        with torch.autocast("cpu", enabled=False):
+            scores = ours @ torch.cat([theirs, unknown], -1).transpose(1, 2)
+            resemblance = torch.log_softmax(scores, -1)
+            share = resemblance.exp()
+            points = views.points.reshape(maps, -1, 3)
+            moments = share @ torch.cat([points, points.square()], -1)
+        mean = moments[..., :3]
+        variance = (moments[..., 3:] - mean.square()).clamp(min=0).sum(-1, keepdim=True)
+        peak = resemblance.detach().amax(-1, keepdim=True)
+        evidence = torch.cat([variance.add(1e-6).sqrt(), peak], -1)
+        return (
+            mean.reshape(batch, -1, 3), evidence.reshape(batch, -1, 2),
+            resemblance.reshape(batch, -1, resemblance.shape[-1]),
+        )  # fmt: skip
 
     def _candidates(self, cells: Tensor, views: SourceViews) -> Tensor:
         """One hidden vector [B, N, width] a source view: V^i_2 of the paper."""

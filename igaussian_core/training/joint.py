@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
 OPTIONS = TrainOptions(
-    steps=4000, batch=32, maps_per_batch=2, learning_rate=1.5e-3, refresh=0, validate_every=200
+    steps=3000, batch=32, maps_per_batch=2, learning_rate=1.5e-3, refresh=0, validate_every=200
 )
 _SIDE = 128
 _SOURCES = 16

@@ -24,6 +24,8 @@ Progress = Callable[[str, int, int], None]
 _LAMBDA_R = 1.0  # the paper's, on degrees
 _LAMBDA_T = 30.0  # the paper's, on map units where an object's radius is 4
 _CLIP = 50.0
+_SAME_PLACE = 0.08  # lengths
+_COMPARED = 24  # cells of an image, drawn anew each step
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class TrainOptions:
         refresh: views a step that are rendered anew.
         points: weight of the error of the cells' scene coordinates (ours).
         candidates: weight of the candidates' own errors, each times its weight (ours).
+        resemblance: weight of the cells' comparison with the source views' (ours).
         seed: of everything random.
         validate_every: steps.
         sources_every: steps after which the source views' features are computed anew.
@@ -50,6 +53,7 @@ class TrainOptions:
     refresh: int = 8
     points: float = 1.0
     candidates: float = 1.0
+    resemblance: float = 20.0
     seed: int = 0
     validate_every: int = 250
     sources_every: int = 10
@@ -115,13 +119,14 @@ def _distance(a: Tensor, b: Tensor) -> Tensor:
 
 
 def pose_loss(
-    prediction: Prediction, truth: Views, weight_t: Tensor, options: TrainOptions
-) -> Tensor:
-    """Section III-C of the paper, with two terms of ours.
+    prediction: Prediction, truth: Views, views: SourceViews, weight_t: Tensor,
+    options: TrainOptions, random: torch.Generator | None = None,
+) -> Tensor:  # fmt: skip
+    """Section III-C of the paper, with three terms of ours.
 
     lambda_r * degrees + lambda_t * distance of the weighted mean; the same of every candidate
-    times its weight, so that each learns and the WPM learns whom to trust; and the distance of
-    the cells' scene coordinates.
+    times its weight, so that each learns and the WPM learns whom to trust; the distance of
+    the cells' scene coordinates; and the `resemblance_loss`.
 
     Args:
         weight_t: [B] of positions in normalised units.
@@ -136,7 +141,33 @@ def pose_loss(
     known = truth.known.float()
     points = (_distance(prediction.points, truth.points) * known).sum((1, 2))
     points = weight_t * points / known.sum((1, 2)).clamp(min=1)
-    return (pose + options.candidates * candidates + options.points * points).mean()
+    loss = (pose + options.candidates * candidates + options.points * points).mean()
+    if prediction.resemblance is None:
+        return loss
+    resembles = resemblance_loss(prediction.resemblance, truth, views, random)
+    return loss + options.resemblance * resembles
+
+
+def resemblance_loss(
+    resemblance: Tensor, truth: Views, views: SourceViews, random: torch.Generator | None = None
+) -> Tensor:
+    """How little a cell is found to resemble the source views' cells that show the same place:
+    minus the logarithm of their share, averaged over some of the cells that any of them shows.
+
+    Args:
+        resemblance: [B, U, N * h * w], logarithms of shares that sum to one.
+        truth: of the B images.
+        views: of M maps.
+    """
+    maps = len(views.points)
+    cells = torch.randperm(resemblance.shape[1], generator=random)[:_COMPARED]
+    ours = truth.points.flatten(1, 2)[:, cells].reshape(maps, -1, 3)
+    near = torch.cdist(ours, views.points.reshape(maps, -1, 3)) < _SAME_PLACE
+    near &= views.known.reshape(maps, 1, -1)
+    shown = near.any(-1) & truth.known.flatten(1)[:, cells].reshape(maps, -1)
+    shares = resemblance[:, cells].reshape(near.shape)[shown]
+    found = torch.logsumexp(shares.masked_fill(~near[shown], -torch.inf), -1)
+    return -found.mean() if len(found) else resemblance.sum() * 0
 
 
 class Trainer:
@@ -216,7 +247,7 @@ class Trainer:
         views = SourceViews(*(torch.cat(parts) for parts in zip(*sources, strict=True)))
         with torch.autocast("cpu", torch.bfloat16):
             prediction = self.network(images, rays, views)
-        loss = pose_loss(prediction, truth, weight_t, self.options)
+        loss = pose_loss(prediction, truth, views, weight_t, self.options, self._random)
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), _CLIP)

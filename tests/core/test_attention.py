@@ -118,11 +118,12 @@ def test_cells_that_resemble_a_source_view_are_told_its_place() -> None:
         features = made.backbone(images(1))
         of = views(made, 3)
         own = torch.stack([features[0], *of.features[0, 1:]])[None]
-        seen, evidence = made._look_up(
+        seen, evidence, resemblance = made._look_up(
             features, of._replace(features=own, known=torch.ones(1, 3, 4, 6, dtype=torch.bool))
         )
     assert torch.allclose(seen[0], of.points[0, 0].reshape(-1, 3), atol=0.05)
-    assert (evidence[0, :, 1] > 0.9).all()
+    assert (evidence[0, :, 1] > -0.1).all()
+    assert torch.allclose(resemblance.exp().sum(-1), torch.ones(1, 24), atol=1e-4)
 
 
 def test_configurations_are_plain_values() -> None:
