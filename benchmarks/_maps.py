@@ -7,10 +7,11 @@ from pathlib import Path
 from _data import data_folder
 
 from igaussian_core.compile_map import CompileOptions, compile_map
-from igaussian_core.map_package import MapPackage, open_package
+from igaussian_core.map_package import MapPackage, NetworkData, open_package, read_tensors
 
 ROOT = Path(__file__).resolve().parents[1]
 DEMO_ROOM = "demo room"
+STAGE_ONE = ROOT / "out" / "stage_one"  # where stage_one.py keeps what it trained
 
 
 def map_sources(name: str) -> tuple[Path, Path]:
@@ -34,3 +35,14 @@ def compiled_path(work: Path, name: str) -> Path:
 def compiled(work: Path, name: str) -> MapPackage:
     """The same, opened."""
     return open_package(compiled_path(work, name))
+
+
+def network_file(name: str, steps: int, work: Path = STAGE_ONE) -> Path:
+    """Where stage_one.py keeps the network that it trained on a map in so many steps."""
+    return work / f"{name.replace(' ', '_')}-{steps}.safetensors"
+
+
+def trained_network(name: str, steps: int) -> NetworkData | None:
+    """That network; None where it was not trained yet."""
+    file = network_file(name, steps)
+    return read_tensors(file) if file.is_file() else None

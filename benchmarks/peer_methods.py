@@ -25,7 +25,7 @@ from igaussian_core.evaluate.coarse_estimator import CoarseOnly
 from igaussian_core.features import Features, Matcher, make_matcher
 from igaussian_core.geometry import compose, inverse
 from igaussian_core.lifting import at_pixels, sample, trusted_depth
-from igaussian_core.localizer import render_scene
+from igaussian_core.localizer import network_of, render_scene
 from igaussian_core.map_package import MapPackage
 from igaussian_core.query import Query
 from igaussian_core.refine.refiner import Refinement, Refiner
@@ -450,6 +450,7 @@ class Staged:
         self._landmarks = LandmarkLocalizer(
             package.landmarks, config.coarse, self._matcher.min_similarity
         )
+        self._network = network_of(package, config)
         self._refiner = Refiner(
             lambda camera, T: render_scene(package, camera, T, config.runtime.threads),
             self._matcher, config.features.keypoints, config.refine, config.verify,
@@ -461,7 +462,11 @@ class Staged:
         timer = StageTimer()
         image, camera = shrunk(image, camera, self._config)
         query = Query(image, camera, self._matcher, self._config.features.keypoints, timer)
-        for hypothesis in self._landmarks.hypotheses(query.features, camera):
+        hypotheses = (
+            self._landmarks.hypotheses(query.features, camera) if self._network is None
+            else self._network.hypotheses(image, camera)
+        )  # fmt: skip
+        for hypothesis in hypotheses:
             refinement = self._refine(self._refiner, query, hypothesis.T_scene_cam)
             evidence = refinement.evidence
             if refinement.T_scene_cam is not None and judge(evidence, self._config.verify)[0].ok:

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from _data import data_folder
-from _maps import DEMO_ROOM, compiled
+from _maps import DEMO_ROOM, compiled, trained_network
 from peer_methods import (
     EssentialMatrix,
     GradientDescent,
@@ -61,6 +61,7 @@ from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import MapPackage
 from igaussian_core.posed_images import PosedImage
 from igaussian_core.sphere import sphere_of
+from igaussian_core.training.map_network import OPTIONS
 from igaussian_core.view_planning import SourceView
 from igaussian_core.views import spherical_views
 
@@ -82,6 +83,7 @@ class Case:
     """Queries in a map with what every method may use, and what success is."""
 
     name: str
+    map: str  # as _maps names it
     package: MapPackage
     references: Callable[[], list[Reference]]
     queries: Queries
@@ -109,12 +111,29 @@ SOLVER_VIT = Config.from_flat({**_UNLIMITED, "refine.solver": "paper", "refine.s
 SIFT = dataclasses.replace(CONFIG, features=dataclasses.replace(CONFIG.features, matcher="sift"))
 
 
-def _paper(case: Case) -> Estimator:
-    raise NotBuilt("the pose attention network")
+def _with_network(case: Case) -> MapPackage:
+    """The case's map with the network that stage_one.py trained on it."""
+    network = trained_network(case.map, OPTIONS.steps)
+    if network is None:
+        raise NotBuilt("a pose network trained on the map: python benchmarks/stage_one.py")
+    return dataclasses.replace(case.package, network=network)
+
+
+def _paper(**refine: Any) -> Callable[[Case], Estimator]:
+    """The paper's stage one, then descriptors matched once and a solver. No wheel brings LoFTR's
+    weights, so XFeat finds the matches."""
+    flat = {"coarse.method": "network", "refine.rounds": 1}
+    config = Config.from_flat(
+        {**_UNLIMITED, **flat, **{f"refine.{k}": v for k, v in refine.items()}}
+    )
+    return lambda c: Staged(_with_network(c), config, lambda r, q, T: r.match(q, T))
 
 
 OURS = Method("ours", lambda c: Localizer(c.package, CONFIG))
-PAPER = Method("paper: network + LoFTR + RANSAC + ViT", _paper)
+CASCADE = Method(
+    "ours, the map with a trained network", lambda c: Localizer(_with_network(c), CONFIG)
+)
+PAPER = Method("paper: network + XFeat + RANSAC + ViT", _paper(solver="paper", scale="vit"))
 SFM = Method("SfM, SIFT (pycolmap), PnP", lambda c: SfmSift(c.package, c.references(), CONFIG))
 ESSENTIAL_SIFT = Method(
     "essential matrix, SIFT", lambda c: EssentialMatrix(c.package, c.references(), SIFT)
@@ -139,7 +158,7 @@ PAPERS_SOLVER_VIT = Method(
     lambda c: Localizer(c.package, SOLVER_VIT),
 )
 PEERS = (
-    OURS, PAPER, PAPERS_SOLVER, PAPERS_SOLVER_VIT, SFM, ESSENTIAL_SIFT, ESSENTIAL_XFEAT,
+    OURS, CASCADE, PAPER, PAPERS_SOLVER, PAPERS_SOLVER_VIT, SFM, ESSENTIAL_SIFT, ESSENTIAL_XFEAT,
     DESCENT_COARSE, DESCENT_PRIOR,
 )  # fmt: skip
 
@@ -150,11 +169,10 @@ def _staged(refine: Callable[..., Any], **settings: Any) -> Callable[[Case], Est
 
 
 ABLATION = (
-    Method("paper: pose attention network alone", _paper),
-    Method("paper: network + WPM", _paper),
-    Method("paper: network + WPM + ViT", _paper),
-    Method("paper: network + WPM + LoFTR and RANSAC", _paper),
-    Method("paper: all", _paper),
+    Method("paper: network + WPM (stage one)", lambda c: CoarseOnly(_with_network(c), CONFIG)),
+    Method("paper: + XFeat, RANSAC, scale by depth", _paper(solver="paper", scale="depth")),
+    Method("paper: + XFeat, RANSAC, scale by ViT", _paper(solver="paper", scale="vit")),
+    Method("paper's stage one + XFeat, PnP in place of RANSAC and ViT", _paper()),
     PAPERS_SOLVER,
     PAPERS_SOLVER_VIT,
     Method("ours: landmarks alone (stage one)", lambda c: CoarseOnly(c.package, CONFIG)),
@@ -167,6 +185,7 @@ ABLATION = (
     Method("ours: all but photometric alignment",
            _staged(lambda r, q, T: r.refine(q, T), photometric="off")),
     dataclasses.replace(OURS, name="ours: + photometric alignment"),
+    CASCADE,
 )  # fmt: skip
 
 
@@ -335,6 +354,7 @@ def _rendered_case(
     source_prior: bool = False,
     pure_rotation: bool = False,
 ) -> Case:
+    map_ = name.split(",")[0]
     sphere, camera = sphere_of(package), camera_of(package)
     usable = [shows_enough(package.gaussians, camera)] if sphere.kind == "scene" else []
     drawn = targets(sphere, scale.each, 0.0 if pure_rotation else 0.2, 0, *usable)
@@ -350,7 +370,8 @@ def _rendered_case(
         return [reference_of_map(package, int(view), CONFIG) for view in chosen]
 
     limit = math.inf if pure_rotation else 0.05
-    return Case(name, package, functools.cache(references), queries, 5.0, limit, scale.steps)
+    references_ = functools.cache(references)
+    return Case(name, map_, package, references_, queries, 5.0, limit, scale.steps)
 
 
 @dataclass(frozen=True)
@@ -389,7 +410,8 @@ def _photo_case(name: str, work: Path, scale: Scale) -> Case:
             for i in _spread(training, scale.references)
         ]
 
-    return Case(name, package, functools.cache(references), queries, 5.0, 0.05 * size, scale.steps)
+    references_ = functools.cache(references)
+    return Case(name, name, package, references_, queries, 5.0, 0.05 * size, scale.steps)
 
 
 def _with_views(package: MapPackage, elevations_deg: tuple[float, ...]) -> MapPackage:

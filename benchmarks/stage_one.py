@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from _data import data_folder
-from _maps import DEMO_ROOM, compiled
+from _maps import DEMO_ROOM, STAGE_ONE, compiled, network_file
 from peers import commit
 from safetensors.numpy import save_file
 
@@ -41,7 +41,6 @@ from igaussian_core.map_package import MapPackage, NetworkData, read_tensors
 from igaussian_core.sphere import sphere_of
 from igaussian_core.training.map_network import OPTIONS, train_map_network
 
-ROOT = Path(__file__).resolve().parents[1]
 MAPS = ("lego", DEMO_ROOM, "redkitchen", "fox", "flower")
 VIEW_COUNTS = (8, 12, 16, 20)
 PLAIN = NetworkConfig(attention="none", lookup=False, weights=False)
@@ -62,7 +61,7 @@ ABLATION = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, help="where to write all figures")
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "stage_one")
+    parser.add_argument("--work", type=Path, default=STAGE_ONE)
     parser.add_argument("--steps", type=int, default=OPTIONS.steps)
     parser.add_argument("--short-steps", type=int, default=1000)
     parser.add_argument("--targets", type=int, default=100, help="in each of three bins")
@@ -92,7 +91,7 @@ def maps_table(options: argparse.Namespace) -> list[dict[str, Any]]:
                              ("network trained on the map", options.steps)):  # fmt: skip
             start = load_checkpoint(shipped_checkpoint())
             trained, seconds = _trained(
-                package, start, steps, 16, options.work / f"{_file(name)}-{steps}.safetensors"
+                package, start, steps, 16, network_file(name, steps, options.work)
             )
             rows.append(_judged(package, name, label, trained, options)
                         | {"train_s": seconds, "steps": steps})  # fmt: skip
@@ -193,10 +192,6 @@ def _photos(package: MapPackage, name: str) -> tuple[PhotoQueries, float]:
     red, green, blue = package.manifest.background
     size = extent(training_images(folder / "map.ply", folder / "poses.json"))
     return PhotoQueries(tuple(images), package.T_map_scene, (red, green, blue)), size
-
-
-def _file(name: str) -> str:
-    return name.replace(" ", "_")
 
 
 if __name__ == "__main__":

@@ -54,10 +54,10 @@ class MapNetwork:
 
     def data(self) -> NetworkData:
         """As a compiled map stores it."""
-        tensors = {_WEIGHT + k: _stored(v) for k, v in self.network.state_dict().items()}
+        tensors = {k: v.numpy() for k, v in _weights(self.network).items()}
         for name, value in self.views._asdict().items():
-            # half of the precision is plenty for features
-            tensors[_VIEWS + name] = _stored(value.half() if name == "features" else value)
+            value = value.half() if name == "features" else value
+            tensors[_VIEWS + name] = np.ascontiguousarray(value.numpy())
         meta = {
             "config": dataclasses.asdict(self.network.config),
             "camera": [getattr(self.camera, f) for f in _CAMERA],
@@ -140,8 +140,12 @@ class NetworkLocalizer:
 _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 
 
-def _stored(value: Tensor) -> NDArray[Any]:
-    return np.ascontiguousarray(value.detach().cpu().numpy())
+def _weights(network: PoseNetwork) -> dict[str, Tensor]:
+    """As they are stored: in half precision, which is plenty for networks of this kind."""
+    return {
+        _WEIGHT + k: (v.half() if v.is_floating_point() else v).contiguous()
+        for k, v in network.state_dict().items()
+    }
 
 
 def save_checkpoint(network: PoseNetwork, path: Path, report: dict[str, Any]) -> None:
@@ -150,13 +154,9 @@ def save_checkpoint(network: PoseNetwork, path: Path, report: dict[str, Any]) ->
     Raises:
         MapError: `path` cannot be written.
     """
-    state = {
-        _WEIGHT + k: (v.half() if v.is_floating_point() else v).contiguous()
-        for k, v in network.state_dict().items()
-    }
     meta = {"config": dataclasses.asdict(network.config), "report": report}
     try:
-        save_file(state, str(path), {"format": FORMAT, "network": json.dumps(meta)})
+        save_file(_weights(network), str(path), {"format": FORMAT, "network": json.dumps(meta)})
     except (OSError, SafetensorError) as error:
         raise MapError(f"{path}: cannot be written: {error}") from error
 
