@@ -26,7 +26,7 @@ from _maps import DEMO_ROOM, STAGE_ONE, compiled, network_file
 from peers import commit
 from safetensors.numpy import save_file
 
-from igaussian_core.coarse.attention import NetworkConfig, PoseNetwork
+from igaussian_core.coarse.attention import PAPER, NetworkConfig, PoseNetwork
 from igaussian_core.coarse.network import load_checkpoint, shipped_checkpoint
 from igaussian_core.compile_map import training_images
 from igaussian_core.config import Config
@@ -47,10 +47,9 @@ PLAIN = NetworkConfig(attention="none", lookup=False, weights=False)
 ABLATION = {
     "plain regression (one source view, nothing asked)": (PLAIN, 1),
     "concatenation with 16 source views, plain mean": (PLAIN, 16),
-    "attention over views (the paper's form), plain mean":
-        (NetworkConfig(attention="views", lookup=False, relative=True, weights=False), 16),
-    "attention over views (the paper's form) + WPM":
-        (NetworkConfig(attention="views", lookup=False, relative=True), 16),
+    "the paper's form, plain mean": (dataclasses.replace(PAPER, weights=False), 16),
+    "the paper's form: attention over views + WPM": (PAPER, 16),
+    "the same with a direct path": (dataclasses.replace(PAPER, direct=True), 16),
     "attention over cells, plain mean": (NetworkConfig(lookup=False, weights=False), 16),
     "attention over cells + WPM": (NetworkConfig(lookup=False), 16),
     "attention over cells and source views + WPM (default)": (NetworkConfig(), 16),

@@ -16,6 +16,7 @@ from igaussian_core.cli_tools import (
     progress_bars,
 )
 from igaussian_core.cli_train_scale import register
+from igaussian_core.errors import ConfigError
 
 train_app = typer.Typer(help="Train networks on views that maps render.", no_args_is_help=True)
 register(train_app)
@@ -24,7 +25,9 @@ StepsOption = Annotated[int | None, typer.Option(help="steps of the optimiser", 
 SeedOption = Annotated[int, typer.Option(help="of everything random")]
 CurvesOption = Annotated[Path | None, typer.Option(help="picture of the curves")]
 BoardOption = Annotated[Path | None, typer.Option(help="folder that TensorBoard reads")]
-AttentionOption = Annotated[str, typer.Option(help="tokens, views (the paper's) or none")]
+AttentionOption = Annotated[
+    str, typer.Option(help="of random weights: tokens, views, none; paper: the whole as printed")
+]
 
 
 @train_app.command("map")
@@ -76,14 +79,13 @@ def train_joint(
     threads: Annotated[int, typer.Option(help="of network and renderer", min=1)] = 2,
 ) -> None:
     """Train one network on many procedural maps: what `train map` starts from."""
-    from igaussian_core.coarse.attention import NetworkConfig
     from igaussian_core.coarse.network import save_checkpoint
     from igaussian_core.training.joint import OPTIONS, train_jointly
 
     options = _options(OPTIONS, steps, seed)
     with progress_bars() as progress:
         network, curve = train_jointly(
-            maps, seed, options, NetworkConfig(attention=attention), threads,
+            maps, seed, options, _config(attention), threads,
             output.with_name(output.name + ".training"), Stages(progress),
         )  # fmt: skip
     last = {name: values[-1] for name, values in curve.values.items()}
@@ -110,12 +112,22 @@ def _options(options: Any, steps: int | None, seed: int) -> Any:
 
 
 def _start(start: str, attention: str) -> Any:
-    from igaussian_core.coarse.attention import NetworkConfig, PoseNetwork
+    from igaussian_core.coarse.attention import PoseNetwork
     from igaussian_core.coarse.network import load_checkpoint, shipped_checkpoint
 
     if start == "random":
-        return PoseNetwork(NetworkConfig(attention=attention))
+        return PoseNetwork(_config(attention))
     return load_checkpoint(shipped_checkpoint() if start == "joint" else Path(start))
+
+
+def _config(attention: str) -> Any:
+    from igaussian_core.coarse.attention import ATTENTIONS, PAPER, NetworkConfig
+
+    if attention == "paper":
+        return PAPER
+    if attention not in ATTENTIONS:
+        raise ConfigError(f"--attention {attention}: none of {', '.join(ATTENTIONS)}, paper")
+    return NetworkConfig(attention=attention)
 
 
 def _write_curve(curve: Any, picture: Path | None, tensorboard: Path | None) -> None:

@@ -6,14 +6,14 @@ Section III-A of the paper, with N source views of known pose rendered from the 
     V^i_1 = FFN_1(softmax(Q K^T / sqrt(d)) V) + V   V^i_2 = FFN_2(V^i_1)   T_i = xi_D(V^i_2)
     w = softmax over i of g(V^i_2)                  T_coarse = sum of w^i T_i
 
-The equations leave open over what the softmax runs. `NetworkConfig(attention="views")` is their
-literal form: one feature vector an image, so that it runs over the source views.
+The equations leave open over what the softmax runs. `PAPER` is their literal form: one feature
+vector an image, so that it runs over the source views, and candidates relative to these.
 "tokens" keeps the image's 16-pixel cells apart: each source pose asks the cells of the target,
 with heads, for what tells its relative pose. `lookup` goes before it: every cell of the target
 is compared with every cell of every source view, and is told where in the scene those that
-resemble it lie (their rendered depth gives the scene coordinates). "none" asks nothing and
-averages the cells: the ablation's plain concatenation; with one view of
-no pose it is plain regression.
+resemble it lie (their rendered depth gives the scene coordinates). `direct` is a path from the
+image alone to the pose. "none" asks nothing and averages the cells: with the direct path, plain
+regression.
 """
 
 from __future__ import annotations
@@ -45,6 +45,8 @@ class NetworkConfig:
         lookup: compare the target's cells with the source views' and hand on their places.
         relative: candidates are predicted in their source camera's frame, else in the scene's.
         weights: combine candidates by the WPM, else by their plain mean.
+        direct: a path from the image alone to the pose, which the candidates correct; the paper
+            has none.
         width: features of a cell and of a source view.
     """
 
@@ -53,7 +55,11 @@ class NetworkConfig:
     lookup: bool = True
     relative: bool = False
     weights: bool = True
+    direct: bool = True
     width: int = 192
+
+
+PAPER = NetworkConfig(attention="views", lookup=False, relative=True, direct=False)
 
 
 class SourceViews(NamedTuple):
@@ -126,10 +132,13 @@ class PoseNetwork(nn.Module):
         self.pooled = nn.Linear(width, 2 * width)
         self.ffn1 = _mlp(2 * width, 2 * width, 2 * width)
         self.ffn2 = _mlp(2 * width + _QUERY, 2 * width, _HIDDEN)
-        self.whole = nn.Linear(channels, _HIDDEN)
         self.decode = nn.Linear(_HIDDEN, 9)
         self.weigh = nn.Linear(_HIDDEN, 1)
-        for layer in (self.weigh, self.ffn2, self.moved):
+        starts_at_zero: list[nn.Module] = [self.weigh, self.moved]
+        if config.direct:
+            self.whole = nn.Linear(channels, _HIDDEN)
+            starts_at_zero.append(self.ffn2)
+        for layer in starts_at_zero:
             nn.init.zeros_(list(layer.parameters())[-2])
 
     def forward(self, images: Tensor, rays: Tensor, views: SourceViews) -> Prediction:
@@ -154,7 +163,9 @@ class PoseNetwork(nn.Module):
         cells = self.cells(cells)
         points = seen + self.points(_flat(features)).float() + self.moved(cells).float()
         points = points.view(batch, height, width, 3)
-        hidden = self.whole(_flat(features).mean(1))[:, None] + self._candidates(cells, views)
+        hidden = self._candidates(cells, views)
+        if self.config.direct:
+            hidden = hidden + self.whole(_flat(features).mean(1))[:, None]
         hidden = F.relu(hidden)
         rotations, positions = self._decoded(hidden, views)
         log_weights = torch.log_softmax(self.weigh(hidden).float().squeeze(-1), 1)

@@ -9,6 +9,7 @@ import torch
 
 from igaussian_core.coarse.attention import (
     ATTENTIONS,
+    PAPER,
     NetworkConfig,
     PoseNetwork,
     Prediction,
@@ -19,6 +20,7 @@ CONFIGS = [
     NetworkConfig(attention=attention, lookup=lookup, relative=relative)
     for attention in ATTENTIONS for lookup in (True, False) for relative in (True, False)
 ]  # fmt: skip
+CONFIGS.append(PAPER)
 
 
 def network(config: NetworkConfig) -> PoseNetwork:
