@@ -64,6 +64,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=OPTIONS.steps)
     parser.add_argument("--short-steps", type=int, default=1000)
     parser.add_argument("--targets", type=int, default=100, help="in each of three bins")
+    parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--only", choices=("maps", "ablation", "views"))
     parser.add_argument("--maps", default=",".join(MAPS), help="of the first table")
     options = parser.parse_args()
@@ -90,7 +91,8 @@ def maps_table(options: argparse.Namespace) -> list[dict[str, Any]]:
                              ("network trained on the map", options.steps)):  # fmt: skip
             start = load_checkpoint(shipped_checkpoint())
             trained, seconds = _trained(
-                package, start, steps, 16, network_file(name, steps, options.work)
+                package, start, steps, 16, network_file(name, steps, options.work),
+                options.threads,
             )
             rows.append(_judged(package, name, label, trained, options)
                         | {"train_s": seconds, "steps": steps})  # fmt: skip
@@ -104,7 +106,7 @@ def ablation_table(options: argparse.Namespace) -> list[dict[str, Any]]:
         torch.manual_seed(0)
         trained, seconds = _trained(
             package, PoseNetwork(config), options.short_steps, sources,
-            options.work / f"ablation-{index}-{options.short_steps}.safetensors",
+            options.work / f"ablation-{index}-{options.short_steps}.safetensors", options.threads,
         )  # fmt: skip
         rows.append(_judged(package, "lego", label, trained, options)
                     | {"train_s": seconds, "steps": options.short_steps})  # fmt: skip
@@ -117,7 +119,7 @@ def views_table(options: argparse.Namespace) -> list[dict[str, Any]]:
         torch.manual_seed(0)
         trained, seconds = _trained(
             package, PoseNetwork(NetworkConfig()), options.short_steps, count,
-            options.work / f"views-{count}-{options.short_steps}.safetensors",
+            options.work / f"views-{count}-{options.short_steps}.safetensors", options.threads,
         )  # fmt: skip
         rows.append(_judged(package, "lego", f"{count} source views", trained, options)
                     | {"train_s": seconds, "steps": options.short_steps})  # fmt: skip
@@ -125,15 +127,16 @@ def views_table(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def _trained(
-    package: MapPackage, start: PoseNetwork, steps: int, sources: int, file: Path
+    package: MapPackage, start: PoseNetwork, steps: int, sources: int, file: Path, threads: int
 ) -> tuple[NetworkData, float]:
     """A network trained on a map, and the seconds that took; from `file` where it is there."""
     if not file.is_file():
         began = time.perf_counter()
         options = dataclasses.replace(OPTIONS, steps=steps)
         trained, _ = train_map_network(
-            package, start, options, sources=sources, bank=8 if steps == 0 else 6000
-        )
+            package, start, options, sources=sources, bank=8 if steps == 0 else 6000,
+            threads=threads,
+        )  # fmt: skip
         data = trained.data()
         seconds = time.perf_counter() - began
         save_file(data.tensors, str(file), {**data.meta, "seconds": str(seconds)})
