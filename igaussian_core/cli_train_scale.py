@@ -35,7 +35,7 @@ def train_scale_vit(
     ] = Path("out/scale_vit"),
     maps: Annotated[int, typer.Option(help="procedural maps to train on", min=1)] = 120,
     places: Annotated[int, typer.Option(help="places in each map", min=1)] = 60,
-    steps: Annotated[int, typer.Option(help="of the optimiser", min=1)] = 2700,
+    steps: Annotated[int, typer.Option(help="of the optimiser", min=1)] = 6000,
     batch: Annotated[int, typer.Option(help="pairs a step", min=1)] = 24,
     rate: Annotated[float, typer.Option(help="highest learning rate", min=1e-9)] = 3e-3,
     every: Annotated[int, typer.Option(help="steps between validations", min=1)] = 250,
