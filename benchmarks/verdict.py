@@ -92,7 +92,8 @@ def main() -> None:
     parser.add_argument("--photos", type=int, default=8, help="most photos of each set")
     parser.add_argument("--set", action="append", default=[], help="configuration, e.g. a.b=1")
     arguments = parser.parse_args()
-    config = load_config(None, arguments.set)
+    # no time limit, so that other work on the machine changes times and not answers
+    config = load_config(None, ["runtime.budget_ms=60000", *arguments.set])
     answers: list[Answer] = []
     with tempfile.TemporaryDirectory() as temporary:
         for name, data_set, with_cameras, kind, prefix in MAPS:
@@ -231,7 +232,7 @@ def _draw(answers: list[Answer], path: Path) -> None:
     )  # fmt: skip
     axes.axvline(0.5, color="black", linestyle="--")
     axes.set(xlabel="confidence", ylabel="images", yscale="log")
-    axes.legend(fontsize=7, loc="upper center")
+    axes.legend(fontsize=7, loc="upper right")
     for part in (left, axes):
         part.grid(alpha=0.3)
     figure.tight_layout()

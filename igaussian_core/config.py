@@ -166,7 +166,7 @@ class VerifyConfig:
         0.7, "largest standard deviation of the pose's rotation, in degrees", 0.01, 90
     )
     min_agreement: float = _option(
-        0.8, "least mean correlation of image and render in cells around the inliers; -1: any",
+        0.81, "least mean correlation of image and render in cells around the inliers; -1: any",
         -1, 1,
     )  # fmt: skip
     min_sharpness: float = _option(
