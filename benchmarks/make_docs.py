@@ -29,6 +29,8 @@ SECTIONS: dict[str, Callable[[dict[str, Any]], str]] = {
         "igaussian eval rendered --map room.igmap --json out.json --report report.html",
     ),
     "photos": tables.photos,
+    "stage_one": tables.stage_one,
+    "scale": tables.scale,
     "render": render_tables.section,
 }
 _HEAD = """# Benchmarks

@@ -161,3 +161,66 @@ def photos(data: Row) -> str:
         "Photos of other scenes, all of which must be refused:",
         markdown(["map", "photos", "accepted", "most inliers"], crossed),
     ])  # fmt: skip
+
+
+def stage_one(data: Row) -> str:
+    """benchmarks/stage_one.py."""
+    parts = [
+        "## Stage one alone",
+        f"`python benchmarks/stage_one.py --json out.json`. {_facts(data)}",
+        "The first hypothesis, unverified. Distances are in map units; a photo's are followed by "
+        "their share of the cameras' extent.",
+    ]
+    titles = {
+        "maps": "Each map", "ablation": "What each part adds (table 4, stage one)",
+        "views": "Number of source views (figure 5)",
+    }  # fmt: skip
+    for name, title in titles.items():
+        if name in data:
+            parts += [f"### {title}", _stage_one_table(data[name])]
+    return "\n\n".join(parts)
+
+
+def _stage_one_table(rows: Sequence[Row]) -> str:
+    bins = list(rows[0]["groups"])
+    head = ["map", "stage one", "training", *(f"{b}°: med °, distance, ≤ 15°" for b in bins),
+            "photos: med °, distance, ≤ 15°", "ms"]  # fmt: skip
+    return markdown(head, [
+        [row["case"], row["method"], _training(row),
+         *(_errors(row["groups"][b]) for b in bins), _errors(row.get("photos"), row.get("extent")),
+         value(row["rendered"], "median_ms")]
+        for row in rows
+    ])  # fmt: skip
+
+
+def _training(row: Row) -> str:
+    return f"{row['steps']} steps, {row['train_s'] / 60:.1f} min" if "train_s" in row else "–"
+
+
+def _errors(figures: Row | None, extent: float | None = None) -> str:
+    if figures is None:
+        return "–"
+    distance = value(figures, "median_distance")
+    if extent and figures["median_distance"] is not None:
+        distance += f" ({figures['median_distance'] / extent:.1%})"
+    median = figures["median_deg"]
+    degrees = "–" if median is None else f"{median:.2f}"
+    return f"{degrees}, {distance}, {value(figures, 'within_15_deg')}"
+
+
+def scale(data: Row) -> str:
+    """benchmarks/scale.py."""
+    lengths = [[name, str(r["pairs"]), *(f"{100 * r[k]:.0f} %" for k in
+                ("network", "depth", "constant"))] for name, r in data["length"].items()]  # fmt: skip
+    solvers = [[name, how, *(f"{100 * r[k]:.0f} %" for k in ("accepted", "success")),
+                f"{r['deg']:.3f}", f"{r['cm']:.2f}"]
+               for name, rows in data["solver"].items() for how, r in rows.items()]  # fmt: skip
+    return "\n\n".join([
+        "## The paper's learned scale",
+        "`python benchmarks/scale.py --map lego.igmap --map room.igmap --each 8`. Median relative "
+        "error of the translation's length between a hypothesis and the image:",
+        markdown(["maps", "pairs", "ViT", "rendered depth", "best constant"], lengths),
+        "The paper's protocol without a prior; medians over accepted poses, map units as cm / 100:",
+        markdown(["map", "solver, scale", "accepted", "within 5°, 5 cm", "med °", "med cm"],
+                 solvers),
+    ])  # fmt: skip
