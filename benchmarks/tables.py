@@ -210,8 +210,9 @@ def _errors(figures: Row | None, extent: float | None = None) -> str:
 
 def scale(data: Row) -> str:
     """benchmarks/scale.py."""
-    lengths = [[name, str(r["pairs"]), *(f"{100 * r[k]:.0f} %" for k in
-                ("network", "depth", "constant"))] for name, r in data["length"].items()]  # fmt: skip
+    kinds = ("network", "depth", "constant")
+    lengths = [[name, str(r["pairs"]), *(f"{100 * r[k]:.0f} %" for k in kinds)]
+               for name, r in data["length"].items()]  # fmt: skip
     solvers = [[name, how, *(f"{100 * r[k]:.0f} %" for k in ("accepted", "success")),
                 f"{r['deg']:.3f}", f"{r['cm']:.2f}"]
                for name, rows in data["solver"].items() for how, r in rows.items()]  # fmt: skip
