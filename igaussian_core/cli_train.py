@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,11 +16,9 @@ from igaussian_core.cli_tools import (
     load_config,
     progress_bars,
 )
-from igaussian_core.cli_train_scale import register
 from igaussian_core.errors import ConfigError
 
 train_app = typer.Typer(help="Train networks on views that maps render.", no_args_is_help=True)
-register(train_app)
 
 StepsOption = Annotated[int | None, typer.Option(help="steps of the optimiser", min=0)]
 SeedOption = Annotated[int, typer.Option(help="of everything random")]
@@ -92,6 +91,38 @@ def train_joint(
     save_checkpoint(network, output, {"maps": maps, "steps": options.steps, **last})
     _write_curve(curve, curves, tensorboard)
     console.print(f"{output}: {last}")
+
+
+@train_app.command("scale-vit")
+def train_scale_vit(
+    folder: Annotated[
+        Path, typer.Option("-o", "--output", help="folder of the run; it goes on where it was")
+    ] = Path("out/scale_vit"),
+    maps: Annotated[int, typer.Option(help="procedural maps to train on", min=1)] = 120,
+    places: Annotated[int, typer.Option(help="places in each map", min=1)] = 60,
+    steps: Annotated[int, typer.Option(help="of the optimiser", min=1)] = 6000,
+    batch: Annotated[int, typer.Option(help="pairs a step", min=1)] = 24,
+    rate: Annotated[float, typer.Option(help="highest learning rate", min=1e-9)] = 3e-3,
+    every: Annotated[int, typer.Option(help="steps between validations", min=1)] = 250,
+    seed: Annotated[int, typer.Option(help="of maps, weights and batches", min=0)] = 0,
+    minutes: Annotated[
+        float | None, typer.Option(help="stop after so many; called again, it goes on", min=0)
+    ] = None,
+    threads: Annotated[int, typer.Option(help="of the network", min=1)] = 2,
+) -> None:
+    """Train the scale ViT; its weights, curves and picture are written to the folder."""
+    import torch
+
+    from igaussian_core.training.scale_vit import ScaleTraining
+    from igaussian_core.training.scale_vit import train_scale_vit as train
+
+    torch.set_num_threads(threads)
+    options = ScaleTraining(
+        maps=maps, places=places, steps=steps, batch=batch, rate=rate, every=every, seed=seed
+    )
+    with progress_bars() as bars:
+        errors = train(folder, options, minutes, Stages(bars))
+    console.print_json(json.dumps({"weights": str(folder / "scale_vit.safetensors"), **errors}))
 
 
 def network_summary(report: dict[str, Any]) -> str:

