@@ -36,14 +36,14 @@ def augmented(rgba: Tensor, background: Tensor, generator: torch.Generator) -> T
     def normal(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator)
 
-    own = uniform(count, 1) < 0.6
+    own = uniform(count, 1) < 0.7
     rgba = _blurred(rgba, uniform(count))
     images = composite(rgba, torch.where(own, background, uniform(count, 3)))
-    gain = torch.exp(0.16 * normal(count, 1, 1, 1) + 0.07 * normal(count, 1, 1, 3))
-    gamma = torch.exp(0.18 * normal(count, 1, 1, 1))
+    gain = torch.exp(0.13 * normal(count, 1, 1, 1) + 0.05 * normal(count, 1, 1, 3))
+    gamma = torch.exp(0.15 * normal(count, 1, 1, 1))
     images = images.clamp(1e-3, 1).pow_(gamma).mul_(gain)
-    images += 0.03 * normal(count, 1, 1, 1)
-    noise = 0.12 * uniform(count, 1, 1, 1).square()
+    images += 0.02 * normal(count, 1, 1, 1)
+    noise = 0.08 * uniform(count, 1, 1, 1).square()
     images += noise * (uniform(count, height, width, 1) - 0.5)
     hidden = _rectangles(uniform, count, height, width)
     images = torch.where(hidden, uniform(count, 1, 1, 3), images)
@@ -53,20 +53,20 @@ def augmented(rgba: Tensor, background: Tensor, generator: torch.Generator) -> T
 
 
 def _blurred(rgba: Tensor, chance: Tensor) -> Tensor:
-    """Uint8 images, two fifths of them as they are, the others blurred over 3 or 5 pixels."""
+    """Uint8 images, most of them as they are, the others blurred over 3 or 5 pixels."""
     images = rgba.numpy().copy()
     for image, draw in zip(images, chance.flatten().tolist(), strict=True):
-        if draw > 0.4:
-            side = 3 if draw < 0.8 else 5
+        if draw > 0.6:
+            side = 3 if draw < 0.9 else 5
             image[:] = cv2.blur(image, (side, side))
     return torch.from_numpy(images)
 
 
 def _rectangles(uniform: Uniform, count: int, height: int, width: int) -> Tensor:
-    """Mask [B, H, W, 1] of one rectangle in a third of the images, else empty."""
+    """Mask [B, H, W, 1] of one rectangle in some of the images, else empty."""
     size = 0.05 + 0.35 * uniform(count, 2)
     corner = uniform(count, 2) * (1 - size)
-    present = uniform(count, 1) < 0.33
+    present = uniform(count, 1) < 0.15
     y, x = torch.arange(height) / height, torch.arange(width) / width
     rows = (y > corner[:, :1]) & (y < (corner + size)[:, :1]) & present
     columns = (x > corner[:, 1:]) & (x < (corner + size)[:, 1:])
@@ -74,8 +74,8 @@ def _rectangles(uniform: Uniform, count: int, height: int, width: int) -> Tensor
 
 
 def _borders(uniform: Uniform, count: int, height: int, width: int) -> Tensor:
-    """Mask [B, H, W, 1] of a frame around a fifth of the images, else empty."""
-    cut = 0.18 * uniform(count, 2) * (uniform(count, 1) < 0.12)
+    """Mask [B, H, W, 1] of a frame around a few of the images, else empty."""
+    cut = 0.18 * uniform(count, 2) * (uniform(count, 1) < 0.05)
     y, x = (torch.arange(height) + 0.5) / height - 0.5, (torch.arange(width) + 0.5) / width - 0.5
     rows = y.abs() > 0.5 - cut[:, :1]
     columns = x.abs() > 0.5 - cut[:, 1:]
