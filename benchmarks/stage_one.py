@@ -1,10 +1,10 @@
 """Stage one alone: what the pose network reaches on each map, and what each of its parts adds.
 
-    python benchmarks/stage_one.py [--json out.json] [--steps 3000] [--short-steps 1000]
+    python benchmarks/stage_one.py [--json out.json] [--steps 3000] [--short-steps 300]
                                    [--work folder] [--only maps|ablation|views]
 
-`maps`: per map the shipped joint weights without training, the network trained on the map, and
-the landmarks, on the paper's protocol (300 rendered targets) and on held-out photos. `ablation`
+`maps`: per map the shipped joint weights without training, the network trained on the map from
+random weights, and the landmarks, on the paper's protocol (300 rendered targets) and on held-out photos. `ablation`
 (the paper's table 4, stage one) and `views` (figure 5): lego, from random weights with
 --short-steps each, so that only the part in question differs. A trained network is kept in
 --work, so that an interrupted benchmark goes on. Needs the data folder (_data.py).
@@ -62,7 +62,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="where to write all figures")
     parser.add_argument("--work", type=Path, default=STAGE_ONE)
     parser.add_argument("--steps", type=int, default=OPTIONS.steps)
-    parser.add_argument("--short-steps", type=int, default=1000)
+    parser.add_argument("--short-steps", type=int, default=300)
     parser.add_argument("--targets", type=int, default=100, help="in each of three bins")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--only", choices=("maps", "ablation", "views"))
@@ -89,7 +89,8 @@ def maps_table(options: argparse.Namespace) -> list[dict[str, Any]]:
         package = compiled(options.work, name)
         for label, steps in (("joint weights, map never seen", 0),
                              ("network trained on the map", options.steps)):  # fmt: skip
-            start = load_checkpoint(shipped_checkpoint())
+            torch.manual_seed(0)
+            start = PoseNetwork(NetworkConfig()) if steps else load_checkpoint(shipped_checkpoint())
             trained, seconds = _trained(
                 package, start, steps, 16, network_file(name, steps, options.work),
                 options.threads,

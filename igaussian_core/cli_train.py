@@ -34,8 +34,8 @@ def train_map(
     map_path: Annotated[Path, typer.Argument(help="compiled map directory (.igmap)")],
     steps: StepsOption = None,
     start: Annotated[
-        str, typer.Option(help="joint: the shipped weights; random; or a checkpoint file")
-    ] = "joint",
+        str, typer.Option(help="random; joint: the shipped weights; or a checkpoint file")
+    ] = "random",
     sources: Annotated[int, typer.Option(help="source views", min=1, max=64)] = 16,
     bank: Annotated[int, typer.Option(help="rendered views kept at a time", min=32)] = 6000,
     seed: SeedOption = 0,
