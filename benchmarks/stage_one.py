@@ -4,9 +4,9 @@
                                    [--work folder] [--only maps|ablation|views]
 
 `maps`: per map the shipped joint weights without training, the network trained on the map from
-random weights, and the landmarks, on the paper's protocol (300 rendered targets) and on held-out photos. `ablation`
-(the paper's table 4, stage one) and `views` (figure 5): lego, from random weights with
---short-steps each, so that only the part in question differs. A trained network is kept in
+random weights, and the landmarks, on the paper's protocol (300 rendered targets) and on
+held-out photos. `ablation` (the paper's table 4, stage one) and `views` (figure 5): lego, from
+random weights with --short-steps each, so that only the part in question differs. A trained network is kept in
 --work, so that an interrupted benchmark goes on. Needs the data folder (_data.py).
 """
 
@@ -26,7 +26,7 @@ from _maps import DEMO_ROOM, STAGE_ONE, compiled, network_file
 from peers import commit
 from safetensors.numpy import save_file
 
-from igaussian_core.coarse.attention import PAPER, NetworkConfig, PoseNetwork
+from igaussian_core.coarse.attention import PAPER, PLAIN, NetworkConfig, PoseNetwork
 from igaussian_core.coarse.network import load_checkpoint, shipped_checkpoint
 from igaussian_core.compile_map import training_images
 from igaussian_core.config import Config
@@ -43,7 +43,6 @@ from igaussian_core.training.map_network import OPTIONS, train_map_network
 
 MAPS = ("lego", DEMO_ROOM, "redkitchen", "fox", "flower")
 VIEW_COUNTS = (8, 12, 16, 20)
-PLAIN = NetworkConfig(attention="none", lookup=False, weights=False)
 ABLATION = {
     "plain regression (one source view, nothing asked)": (PLAIN, 1),
     "concatenation with 16 source views, plain mean": (PLAIN, 16),

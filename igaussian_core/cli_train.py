@@ -25,7 +25,7 @@ SeedOption = Annotated[int, typer.Option(help="of everything random")]
 CurvesOption = Annotated[Path | None, typer.Option(help="picture of the curves")]
 BoardOption = Annotated[Path | None, typer.Option(help="folder that TensorBoard reads")]
 AttentionOption = Annotated[
-    str, typer.Option(help="of random weights: tokens, views, none; paper: the whole as printed")
+    str, typer.Option(help="of random weights: tokens, views, none; paper; plain regression")
 ]
 
 
@@ -152,12 +152,14 @@ def _start(start: str, attention: str) -> Any:
 
 
 def _config(attention: str) -> Any:
-    from igaussian_core.coarse.attention import ATTENTIONS, PAPER, NetworkConfig
+    from igaussian_core.coarse.attention import ATTENTIONS, PAPER, PLAIN, NetworkConfig
 
-    if attention == "paper":
-        return PAPER
+    whole = {"paper": PAPER, "plain": PLAIN}
+    if attention in whole:
+        return whole[attention]
     if attention not in ATTENTIONS:
-        raise ConfigError(f"--attention {attention}: none of {', '.join(ATTENTIONS)}, paper")
+        known = ", ".join((*ATTENTIONS, *whole))
+        raise ConfigError(f"--attention {attention}: none of {known}")
     return NetworkConfig(attention=attention)
 
 

@@ -60,6 +60,7 @@ class NetworkConfig:
 
 
 PAPER = NetworkConfig(attention="views", lookup=False, relative=True, direct=False)
+PLAIN = NetworkConfig(attention="none", lookup=False, weights=False)  # regression
 
 
 class SourceViews(NamedTuple):

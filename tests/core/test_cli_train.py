@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from igaussian_core.cli import app
 from igaussian_core.coarse.network import load_checkpoint
-from igaussian_core.errors import MapError
+from igaussian_core.errors import ConfigError, MapError
 from igaussian_core.map_package import open_package
 
 
@@ -75,3 +75,15 @@ def test_the_layout_of_the_cameras_as_a_picture(copied: Path, tmp_path: Path) ->
     picture = cv2.imread(str(tmp_path / "views.png"))
     assert picture is not None and picture.shape[0] > 500 and picture.std() > 5
     assert "R = " in output
+
+
+@pytest.mark.parametrize("attention", ["paper", "plain", "views"])
+def test_other_networks_can_be_trained(copied: Path, attention: str) -> None:
+    run("train", "map", copied, "--steps", 1, "--bank", 32, "--sources", 2, "--attention",
+        attention)  # fmt: skip
+    assert open_package(copied).network is not None
+
+
+def test_an_unknown_network_is_named(copied: Path) -> None:
+    with pytest.raises(ConfigError, match="--attention more: none of tokens"):
+        run("train", "map", copied, "--attention", "more")
