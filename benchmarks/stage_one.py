@@ -6,8 +6,9 @@
 `maps`: per map the shipped joint weights without training, the network trained on the map from
 random weights, and the landmarks, on the paper's protocol (300 rendered targets) and on
 held-out photos. `ablation` (the paper's table 4, stage one) and `views` (figure 5): lego, from
-random weights with --short-steps each, so that only the part in question differs. A trained network is kept in
---work, so that an interrupted benchmark goes on. Needs the data folder (_data.py).
+random weights with --short-steps each, so that only the part in question differs. A trained
+network is kept in --work, so that an interrupted benchmark goes on. Needs the data folder
+(_data.py).
 """
 
 from __future__ import annotations
