@@ -16,8 +16,10 @@ class Hypothesis:
         T_scene_cam: 4x4 float64.
         score: the larger the better; comparable among hypotheses of one source only.
         source: "prior", "landmarks", "network".
+        describe: whether stage two may match descriptors where alignment does not convince.
     """
 
     T_scene_cam: NDArray[np.float64]
     score: float
     source: str
+    describe: bool = True

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -151,30 +152,39 @@ class Localizer:
 
     def _hypotheses(self, query: Query, prior: ArrayLike | None) -> Iterator[Hypothesis]:
         """Stage one: the prior, then what the network says, then places that the landmarks know;
-        found as asked for."""
+        found as asked for.
+
+        In the cascade the network's places are only aligned at first: where that does not
+        convince, the landmarks cost less than matching descriptors at a wrong place. They come
+        again, with descriptors, where the landmarks know none.
+        """
         if prior is not None:
             if not is_rigid(prior):
                 raise CameraError("prior: expected a rigid 4x4 transform T_map_cam")
             yield Hypothesis(self._T_map_scene.inverse().camera(prior), 0.0, "prior")
+        cascade = self._config.coarse.method == "cascade"
+        asked: list[Hypothesis] = []
         if self._network is not None:
-            yield from _timed_each(query, self._network.hypotheses(query.image, query.camera))
+            said = self._network.hypotheses(query.image, query.camera)
+            for hypothesis in _timed_each(query, said):
+                asked.append(hypothesis)
+                yield replace(hypothesis, describe=not cascade)
         if self._config.coarse.method != "network":
             yield from _timed_each(
                 query, self._landmarks.hypotheses(query.features, query.camera)
             )
+        if cascade:
+            yield from asked
 
     def _refine(
         self, query: Query, hypothesis: Hypothesis, prior: ArrayLike | None
     ) -> Refinement:
-        """Stage two. What the network says is only aligned in the cascade: where that does not
-        convince, the landmarks cost less than matching descriptors at a wrong place."""
-        from_network = hypothesis.source == "network"
         return self._refiner.refine(
             query,
             hypothesis.T_scene_cam,
             near=hypothesis.source == "prior",
             prior=None if prior is None else self._T_map_scene.inverse().camera(prior),
-            describe=not (from_network and self._config.coarse.method == "cascade"),
+            describe=hypothesis.describe,
         )
 
     def _result(self, hypothesis: Hypothesis, refinement: Refinement) -> LocalizationResult:

@@ -31,7 +31,9 @@ from igaussian_core.geometry import (
 )
 from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import MapPackage, NetworkData, open_package
+from igaussian_core.query import Query
 from igaussian_core.sphere import Sphere
+from igaussian_core.timing import StageTimer
 from igaussian_core.training.augment import augmented, composite
 from igaussian_core.training.bank import Bank, draw_views
 from igaussian_core.training.curves import plot_curve, write_tensorboard
@@ -308,6 +310,10 @@ def test_the_localizer_asks_the_network_first(
     cascade = Localizer(with_network, Config.from_flat({"runtime.budget_ms": 60000.0}))
     cascade.warm_up()
     result = cascade.localize(image, rooms.CAMERA)
+    query = Query(image, rooms.CAMERA, cascade._matcher, 256, StageTimer())
+    asked = [(h.source, h.describe) for h in cascade._hypotheses(query, None)]
+    assert asked[0] == ("network", False) and asked[-1] == ("network", True)
+    assert ("landmarks", True) in asked
     assert result.ok and result.source in ("network", "landmarks")
     alone = Localizer(with_network, Config.from_flat({"coarse.method": "network"}))
     assert alone.localize(image, rooms.CAMERA).source == "network"
