@@ -122,7 +122,7 @@ def _with_network(case: Case) -> MapPackage:
 def _paper(**refine: Any) -> Callable[[Case], Estimator]:
     """The paper's stage one, then descriptors matched once and a solver. No wheel brings LoFTR's
     weights, so XFeat finds the matches."""
-    flat = {"coarse.method": "network", "refine.rounds": 1}
+    flat = {"coarse.method": "network", "coarse.network_head": "attention", "refine.rounds": 1}
     config = Config.from_flat(
         {**_UNLIMITED, **flat, **{f"refine.{k}": v for k, v in refine.items()}}
     )

@@ -6,9 +6,10 @@
 `maps`: per map the shipped joint weights without training, the network trained on the map from
 random weights, and the landmarks, on the paper's protocol (300 rendered targets) and on
 held-out photos. `ablation` (the paper's table 4, stage one) and `views` (figure 5): lego, from
-random weights with --short-steps each, so that only the part in question differs. A trained
-network is kept in --work, so that an interrupted benchmark goes on. Needs the data folder
-(_data.py).
+random weights with --short-steps each, so that only the part in question differs. Networks
+predict by their heads ("heads": candidates and weights of the source views) and by the memory
+of views of known pose. A trained network is kept in --work, so that an interrupted benchmark
+goes on. Needs the data folder (_data.py).
 """
 
 from __future__ import annotations
@@ -40,10 +41,11 @@ from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.evaluate.runner import Queries, run
 from igaussian_core.map_package import MapPackage, NetworkData, read_tensors
 from igaussian_core.sphere import sphere_of
-from igaussian_core.training.map_network import OPTIONS, train_map_network
+from igaussian_core.training.map_network import MEMORY, OPTIONS, train_map_network
 
 MAPS = ("lego", DEMO_ROOM, "redkitchen", "fox", "flower")
 VIEW_COUNTS = (8, 12, 16, 20)
+SHORT_MEMORY = 4000
 ABLATION = {
     "plain regression (one source view, nothing asked)": (PLAIN, 1),
     "concatenation with 16 source views, plain mean": (PLAIN, 16),
@@ -73,7 +75,7 @@ def main() -> None:
     report: dict[str, Any] = {"facts": {**machine_facts(), "commit": commit()}}
     report["facts"]["training"] = (
         f"{options.steps} steps of {OPTIONS.batch} views a map; ablation and views "
-        f"{options.short_steps} steps from random weights"
+        f"{options.short_steps} steps from random weights, {SHORT_MEMORY} views remembered"
     )
     report["facts"]["queries"] = f"{options.targets} rendered targets a bin, held-out photos"
     for name, make in tables.items():
@@ -91,75 +93,85 @@ def maps_table(options: argparse.Namespace) -> list[dict[str, Any]]:
                              ("network trained on the map", options.steps)):  # fmt: skip
             torch.manual_seed(0)
             start = PoseNetwork(NetworkConfig()) if steps else load_checkpoint(shipped_checkpoint())
-            trained, seconds = _trained(
-                package, start, steps, 16, network_file(name, steps, options.work),
+            trained = _trained(
+                package, start, steps, 16, MEMORY, network_file(name, steps, options.work),
                 options.threads,
             )
-            rows.append(_judged(package, name, label, trained, options)
-                        | {"train_s": seconds, "steps": steps})  # fmt: skip
-        rows.append(_judged(package, name, "landmarks (no training)", None, options))
+            rows += _judged(package, name, label, trained, options)
+        rows += _judged(package, name, "landmarks (no training)", None, options)
     return rows
 
 
 def ablation_table(options: argparse.Namespace) -> list[dict[str, Any]]:
-    package, rows = compiled(options.work, "lego"), []
-    for index, (label, (config, sources)) in enumerate(ABLATION.items()):
-        torch.manual_seed(0)
-        trained, seconds = _trained(
-            package, PoseNetwork(config), options.short_steps, sources,
-            options.work / f"ablation-{index}-{options.short_steps}.safetensors", options.threads,
-        )  # fmt: skip
-        rows.append(_judged(package, "lego", label, trained, options)
-                    | {"train_s": seconds, "steps": options.short_steps})  # fmt: skip
-    return rows
+    parts = [
+        (label, config, sources, f"ablation-{index}")
+        for index, (label, (config, sources)) in enumerate(ABLATION.items())
+    ]
+    return _short_trainings(parts, options)
 
 
 def views_table(options: argparse.Namespace) -> list[dict[str, Any]]:
+    parts = [(f"{n} source views", NetworkConfig(), n, f"views-{n}") for n in VIEW_COUNTS]
+    return _short_trainings(parts, options)
+
+
+def _short_trainings(
+    parts: list[tuple[str, NetworkConfig, int, str]], options: argparse.Namespace
+) -> list[dict[str, Any]]:
+    """Of lego, each of a label, what the network is made of, source views, name of a file."""
     package, rows = compiled(options.work, "lego"), []
-    for count in VIEW_COUNTS:
+    for label, config, sources, file in parts:
         torch.manual_seed(0)
-        trained, seconds = _trained(
-            package, PoseNetwork(NetworkConfig()), options.short_steps, count,
-            options.work / f"views-{count}-{options.short_steps}.safetensors", options.threads,
+        trained = _trained(
+            package, PoseNetwork(config), options.short_steps, sources, SHORT_MEMORY,
+            options.work / f"{file}-{options.short_steps}.safetensors", options.threads,
         )  # fmt: skip
-        rows.append(_judged(package, "lego", f"{count} source views", trained, options)
-                    | {"train_s": seconds, "steps": options.short_steps})  # fmt: skip
+        rows += _judged(package, "lego", label, trained, options)
     return rows
 
 
 def _trained(
-    package: MapPackage, start: PoseNetwork, steps: int, sources: int, file: Path, threads: int
-) -> tuple[NetworkData, float]:
-    """A network trained on a map, and the seconds that took; from `file` where it is there."""
+    package: MapPackage, start: PoseNetwork, steps: int, sources: int, memory: int, file: Path,
+    threads: int,
+) -> NetworkData:  # fmt: skip
+    """A network trained on a map; from `file` where it is there."""
     if not file.is_file():
         began = time.perf_counter()
         options = dataclasses.replace(OPTIONS, steps=steps)
         trained, _ = train_map_network(
-            package, start, options, sources=sources, bank=8 if steps == 0 else 6000,
+            package, start, options, sources=sources, bank=6000 if steps else 8, memory=memory,
             threads=threads,
         )  # fmt: skip
         data = trained.data()
-        seconds = time.perf_counter() - began
-        save_file(data.tensors, str(file), {**data.meta, "seconds": str(seconds)})
-    data = read_tensors(file)
-    return data, float(data.meta["seconds"])
+        facts = {"seconds": str(time.perf_counter() - began), "steps": str(steps)}
+        save_file(data.tensors, str(file), {**data.meta, **facts})
+    return read_tensors(file)
 
 
 def _judged(
     package: MapPackage, name: str, method: str, network: NetworkData | None,
     options: argparse.Namespace,
-) -> dict[str, Any]:  # fmt: skip
-    config = Config.from_flat({"coarse.method": "network" if network else "landmarks"})
-    estimator = CoarseOnly(dataclasses.replace(package, network=network), config)
-    row: dict[str, Any] = {"case": name, "method": method}
-    row["rendered"], row["groups"] = _figures(estimator, _rendered(package, options.targets))
-    if name != DEMO_ROOM:
-        queries, size = _photos(package, name)
-        row["photos"], _ = _figures(estimator, queries)
-        row["extent"] = size
-    print(name, method, json.dumps({k: _short(v) for k, v in row.items() if isinstance(v, dict)}),
-          flush=True)  # fmt: skip
-    return row
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Rows of a network's heads and of its memory, or one of the landmarks."""
+    rows = []
+    for head in ("attention", "memory") if network else ("",):
+        config = Config.from_flat(
+            {"coarse.method": "network", "coarse.network_head": head} if network
+            else {"coarse.method": "landmarks"}
+        )  # fmt: skip
+        estimator = CoarseOnly(dataclasses.replace(package, network=network), config)
+        row: dict[str, Any] = {"case": name, "method": method, "head": head}
+        if network:
+            row |= {"train_s": float(network.meta["seconds"]), "steps": int(network.meta["steps"])}
+        row["rendered"], row["groups"] = _figures(estimator, _rendered(package, options.targets))
+        if name != DEMO_ROOM:
+            queries, row["extent"] = _photos(package, name)
+            row["photos"], _ = _figures(estimator, queries)
+        print(name, method, head, json.dumps(
+            {k: _short(v) for k, v in row.items() if isinstance(v, dict)}), flush=True
+        )  # fmt: skip
+        rows.append(row)
+    return rows
 
 
 def _figures(estimator: CoarseOnly, queries: Queries) -> tuple[dict[str, Any], dict[str, Any]]:

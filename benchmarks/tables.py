@@ -169,7 +169,9 @@ def stage_one(data: Row) -> str:
         "## Stage one alone",
         f"`python benchmarks/stage_one.py --json out.json`. {_facts(data)}",
         "The first hypothesis, unverified. Distances are in map units; a photo's are followed by "
-        "their share of the cameras' extent.",
+        "their share of the cameras' extent. Heads: the paper's candidates and weights of the "
+        "source views; memory: kernel regression among thousands of views of known pose, by the "
+        "same network's features.",
     ]
     titles = {
         "maps": "Each map", "ablation": "What each part adds (table 4, stage one)",
@@ -183,14 +185,18 @@ def stage_one(data: Row) -> str:
 
 def _stage_one_table(rows: Sequence[Row]) -> str:
     bins = list(rows[0]["groups"])
-    head = ["map", "stage one", "training", *(f"{b}°: med °, distance, ≤ 15°" for b in bins),
+    head = ["map", "stage one", "predicts by", "training",
+            *(f"{b}°: med °, distance, ≤ 15°" for b in bins),
             "photos: med °, distance, ≤ 15°", "ms"]  # fmt: skip
     return markdown(head, [
-        [row["case"], row["method"], _training(row),
+        [row["case"], row["method"], _HEADS[row["head"]], _training(row),
          *(_errors(row["groups"][b]) for b in bins), _errors(row.get("photos"), row.get("extent")),
          value(row["rendered"], "median_ms")]
         for row in rows
     ])  # fmt: skip
+
+
+_HEADS = {"attention": "heads", "memory": "memory", "": "–"}
 
 
 def _training(row: Row) -> str:

@@ -69,6 +69,12 @@ class CoarseConfig:
     max_reprojection_px: float = _option(8.0, "inlier threshold of landmark PnP in pixels", 0.5, 64)
     min_inliers: int = _option(12, "least inliers of a hypothesis", 4, 1000)
     hypotheses: int = _option(3, "hypotheses handed to stage two", 1, 16)
+    network_head: str = _option(
+        "memory",
+        "memory: regression among thousands of views of known pose; attention: candidates and "
+        "weights of the paper's source views; either where the map's network has no other",
+        choices=("memory", "attention"),
+    )
     network_hypotheses: int = _option(
         2, "hypotheses of the pose network handed to stage two", 1, 16
     )

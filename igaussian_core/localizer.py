@@ -251,7 +251,9 @@ def network_of(package: MapPackage, config: Config) -> NetworkLocalizer | None:
             )
         return None
     trained = MapNetwork.from_data(package.network, f"map '{name}'")
-    return NetworkLocalizer(trained, config.coarse.network_hypotheses)
+    return NetworkLocalizer(
+        trained, config.coarse.network_hypotheses, config.coarse.network_head
+    )
 
 
 def _timed_each(query: Query, candidates: Iterator[Hypothesis]) -> Iterator[Hypothesis]:

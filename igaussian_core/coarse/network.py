@@ -16,8 +16,9 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from igaussian_core.camera import Camera
-from igaussian_core.coarse.attention import NetworkConfig, PoseNetwork, Prediction, SourceViews
+from igaussian_core.coarse.attention import NetworkConfig, PoseNetwork, SourceViews
 from igaussian_core.coarse.canonical import cell_rays, resampled, to_tensor
+from igaussian_core.coarse.memory import ViewMemory
 from igaussian_core.coarse.pose_scale import PoseScale
 from igaussian_core.errors import MapError
 from igaussian_core.geometry import compose, mean_rotation, pose_error
@@ -30,6 +31,7 @@ Image = NDArray[np.uint8]
 FORMAT = "igaussian-pose-network-1"
 _WEIGHT = "network."
 _VIEWS = "views."
+_MEMORY = "memory."
 # hypotheses nearer than that to one before them are left out
 _SAME_DEG, _SAME_LENGTHS = 5.0, 0.1
 
@@ -44,6 +46,8 @@ class MapNetwork:
         camera: the canonical camera of images and source views.
         scale: from normalised to scene units.
         report: what training says of it: steps, errors on views that it was not trained on.
+        memory: views whose poses predict, by the backbone's features; None: the network's
+            candidates and weights do.
     """
 
     network: PoseNetwork
@@ -51,6 +55,7 @@ class MapNetwork:
     camera: Camera
     scale: PoseScale
     report: dict[str, Any]
+    memory: ViewMemory | None = None
 
     def data(self) -> NetworkData:
         """As a compiled map stores it."""
@@ -58,6 +63,8 @@ class MapNetwork:
         for name, value in self.views._asdict().items():
             value = value.half() if name == "features" else value
             tensors[_VIEWS + name] = np.ascontiguousarray(value.numpy())
+        for name, value in self.memory._asdict().items() if self.memory else ():
+            tensors[_MEMORY + name] = np.ascontiguousarray(value.numpy())
         meta = {
             "config": dataclasses.asdict(self.network.config),
             "camera": [getattr(self.camera, f) for f in _CAMERA],
@@ -76,12 +83,13 @@ class MapNetwork:
             views = SourceViews(
                 **{f: torch.from_numpy(data.tensors[_VIEWS + f]) for f in SourceViews._fields}
             )
+            memory = _memory_of(data.tensors)
             camera = Camera(**dict(zip(_CAMERA, meta["camera"], strict=True)))
             scale = PoseScale(tuple(meta["scale"]["centre"]), float(meta["scale"]["length"]))
         except (KeyError, TypeError, ValueError) as error:
             raise MapError(f"{origin}: damaged pose network: {error}") from error
         views = views._replace(features=views.features.float())
-        return MapNetwork(network.eval(), views, camera, scale, meta.get("report", {}))
+        return MapNetwork(network.eval(), views, camera, scale, meta.get("report", {}), memory)
 
 
 class NetworkLocalizer:
@@ -90,47 +98,62 @@ class NetworkLocalizer:
     Args:
         trained: the map's network.
         hypotheses: most that are handed on.
+        head: "memory", where there is one, or "attention".
     """
 
-    def __init__(self, trained: MapNetwork, hypotheses: int) -> None:
+    def __init__(self, trained: MapNetwork, hypotheses: int, head: str = "memory") -> None:
         self._trained = trained
         self._count = hypotheses
+        self._memory = trained.memory if head == "memory" else None
         self._rays = cell_rays(trained.camera)[None]
 
-    @torch.inference_mode()
-    def predict(self, image: Image, camera: Camera) -> Prediction:
-        """What the network says of an image of a pinhole camera, normalised units, batch 1."""
-        trained = self._trained
-        x = to_tensor(resampled(image, camera, trained.camera)[None])
-        return trained.network(x, self._rays, trained.views)
-
     def hypotheses(self, image: Image, camera: Camera) -> Iterator[Hypothesis]:
-        """The weighted mean first, then source views' candidates by falling weight that say
-        something else.
+        """The best guess first, then others that say something else.
+
+        Of the memory the regressed pose, then those of single views by falling similarity; of
+        the attention the weighted mean, then candidates of single source views by falling
+        weight.
 
         Args:
             image: uint8 RGB [H, W, 3].
             camera: its pinhole camera.
         """
         found: list[Array] = []
-        for T_scene_cam, score in self._poses(self.predict(image, camera)):
+        for T_scene_cam, score in self._poses(image, camera):
             if len(found) == self._count:
                 return
             if all(self._differs(T_scene_cam, other) for other in found):
                 found.append(T_scene_cam)
                 yield Hypothesis(T_scene_cam, score, "network")
 
-    def _poses(self, prediction: Prediction) -> Iterator[tuple[Array, float]]:
-        rotations, positions = (
-            part[0].double().numpy()
-            for part in (prediction.candidate_rotations, prediction.candidate_positions)
-        )
-        weights = prediction.log_weights[0].double().exp().numpy()
+    def _poses(self, image: Image, camera: Camera) -> Iterator[tuple[Array, float]]:
+        x = to_tensor(resampled(image, camera, self._trained.camera)[None])
+        with torch.inference_mode():
+            features = self._trained.network.backbone(x)
         scene = self._trained.scale.scene
-        mean = compose(mean_rotation(rotations, weights), scene(weights @ positions))
-        yield mean, 1.0
+        found = self._attended(features) if self._memory is None else self._remembered(features)
+        for rotation, position, score in found:
+            yield compose(rotation, scene(position)), score
+
+    def _remembered(self, features: Tensor) -> Iterator[tuple[Array, Array, float]]:
+        assert self._memory is not None
+        with torch.inference_mode():
+            similarity = self._memory.similarity(features)
+            rotations, positions = self._memory.regressed(similarity)
+        yield rotations[0], positions[0], 1.0
+        score, order = similarity[0].sort(descending=True, stable=True)
+        for value, index in zip(score.tolist(), order.tolist(), strict=True):
+            yield *self._memory.pose_of(index), value
+
+    def _attended(self, features: Tensor) -> Iterator[tuple[Array, Array, float]]:
+        with torch.inference_mode():
+            said = self._trained.network.predict(features, self._rays, self._trained.views)
+        candidates = said.candidate_rotations, said.candidate_positions
+        rotations, positions = (part[0].double().numpy() for part in candidates)
+        weights = said.log_weights[0].double().exp().numpy()
+        yield mean_rotation(rotations, weights), weights @ positions, 1.0
         for index in np.argsort(-weights, kind="stable"):
-            yield compose(rotations[index], scene(positions[index])), float(weights[index])
+            yield rotations[index], positions[index], float(weights[index])
 
     def _differs(self, T_a: Array, T_b: Array) -> bool:
         angle, distance = pose_error(T_a, T_b)
@@ -138,6 +161,13 @@ class NetworkLocalizer:
 
 
 _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
+
+
+def _memory_of(tensors: dict[str, NDArray[Any]]) -> ViewMemory | None:
+    names = [_MEMORY + name for name in ViewMemory._fields]
+    if not any(name in tensors for name in names):
+        return None
+    return ViewMemory(*(torch.from_numpy(tensors[name]) for name in names))
 
 
 def _weights(network: PoseNetwork) -> dict[str, Tensor]:

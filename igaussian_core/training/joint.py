@@ -53,7 +53,7 @@ def train_jointly(
     for index in range(maps):
         data.append(procedural_training_map(first_seed + index, threads))
         progress("maps", index + 1, maps)
-    trainer = Trainer(PoseNetwork(config or NetworkConfig()), data, options, checkpoint)
+    trainer = Trainer(PoseNetwork(config or NetworkConfig()), data, options, checkpoint, threads)
     return trainer.network, trainer.run(progress)
 
 

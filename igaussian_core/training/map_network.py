@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from igaussian_core.camera import Camera
 from igaussian_core.coarse.attention import PoseNetwork
 from igaussian_core.coarse.canonical import canonical_camera, cell_rays
+from igaussian_core.coarse.memory import ViewMemory, fit_memory, raw_keys
 from igaussian_core.coarse.network import MapNetwork
 from igaussian_core.coarse.pose_scale import PoseScale
 from igaussian_core.map_package import MapPackage
 from igaussian_core.sphere import Sphere, sphere_of
-from igaussian_core.training.bank import Bank, ViewRenderer, draw_views
+from igaussian_core.training.augment import augmented, composite
+from igaussian_core.training.bank import Bank, ViewRenderer, Views, draw_views
 from igaussian_core.training.pose_network import (
     Curve,
     Trainer,
@@ -26,6 +28,7 @@ from igaussian_core.training.pose_network import (
     TrainOptions,
     held_out_errors,
     lambda_t,
+    rotation_error_deg,
     source_views,
 )
 from igaussian_core.training.poses import PoseSampler
@@ -34,11 +37,13 @@ from igaussian_core.views import spherical_views, spread_indices
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
-OPTIONS = TrainOptions()
+OPTIONS = TrainOptions(steps=2500)
 BANK = 6000
+MEMORY = 12000
 HELD_OUT = 256
 _MIN_COVERED = 0.6  # of a scene's view; an object may fill little of one
 _NEAR_KNOWN = {"object": 0.3, "scene": 0.55}
+_CHUNK = 64
 _HELD_OUT_SEED = 1_000_003
 
 
@@ -121,11 +126,15 @@ def train_map_network(
     *,
     sources: int = 16,
     bank: int = BANK,
+    memory: int = MEMORY,
     threads: int = 2,
     checkpoint: Path | None = None,
     progress: Progress = lambda stage, done, of: None,
 ) -> tuple[MapNetwork, Curve]:
     """Train a network, from `start`'s weights, on views that a compiled map renders of itself.
+
+    Args:
+        memory: views whose poses are kept to predict by; 0: none, the network's heads do.
 
     Raises:
         MapError: the map shows next to nothing from where views are drawn.
@@ -134,19 +143,78 @@ def train_map_network(
     torch.set_num_threads(threads)
     setting = setting_of(package, sources, threads)
     data = training_map(package.manifest.name, setting, bank, options.seed, progress)
-    trainer = Trainer(start, [data], options, checkpoint)
+    trainer = Trainer(start, [data], options, checkpoint, threads)
     curve = trainer.run(progress)
-    return trained_network(trainer.network, data, setting, options), curve
+    views = remember(trainer.network, data, setting, memory, options.seed, progress)
+    return trained_network(trainer.network, data, setting, options, views), curve
+
+
+def remember(
+    network: PoseNetwork, data: TrainingMap, setting: Setting, count: int, seed: int,
+    progress: Progress = lambda stage, done, of: None,
+) -> ViewMemory | None:  # fmt: skip
+    """A memory of `count` views: those of the bank, and new ones; None of none.
+
+    Each is changed as in training, so that the regression knows how much that does.
+    """
+    if count == 0:
+        return None
+    network.eval()
+    random, rng = torch.Generator().manual_seed(seed + 1), np.random.default_rng([seed, 99])
+    keys, rotations, positions = [], [], []
+    done = 0
+    while done < count:
+        kept = min(_CHUNK, count - done, max(len(data.bank) - done, 0))
+        if kept:
+            views = data.bank.views.at(np.arange(done, done + kept))
+        else:
+            views = draw_views(
+                setting.renderer, setting.sampler, rng, min(_CHUNK, count - done)
+            )
+        images = augmented(views.rgba, setting.background, random)
+        keys.append(_raw_keys(network, images))
+        rotations.append(views.rotation)
+        positions.append(views.position)
+        done += len(views.rgba)
+        progress("remembered views", done, count)
+    return fit_memory(torch.cat(keys), torch.cat(rotations), torch.cat(positions))
+
+
+@torch.no_grad()
+def _raw_keys(network: PoseNetwork, images: torch.Tensor) -> torch.Tensor:
+    return raw_keys(network.backbone(images))
+
+
+def remembered_errors(
+    network: PoseNetwork, memory: ViewMemory, data: TrainingMap
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """As `held_out_errors`, of the memory's regression."""
+    degrees, lengths = [], []
+    held_out = data.held_out
+    for start in range(0, len(held_out.rgba), _CHUNK):
+        part = Views(*(field[start : start + _CHUNK] for field in held_out))
+        images = composite(part.rgba, data.background[None]).permute(0, 3, 1, 2).contiguous()
+        with torch.no_grad():
+            rotations, positions = memory.regressed(memory.similarity(network.backbone(images)))
+        degrees.append(rotation_error_deg(torch.from_numpy(rotations).float(), part.rotation))
+        lengths.append((torch.from_numpy(positions).float() - part.position).norm(dim=-1))
+    return torch.cat(degrees).numpy(), torch.cat(lengths).numpy()
 
 
 def trained_network(
-    network: PoseNetwork, data: TrainingMap, setting: Setting, options: TrainOptions
-) -> MapNetwork:
+    network: PoseNetwork, data: TrainingMap, setting: Setting, options: TrainOptions,
+    memory: ViewMemory | None = None,
+) -> MapNetwork:  # fmt: skip
     """A network in evaluation mode with a map's source views and a report on held-out views."""
-    degrees, lengths = held_out_errors(network, data)
+    network.eval()
+    if memory is None:
+        degrees, lengths = held_out_errors(network, data)
+    else:
+        degrees, lengths = remembered_errors(network, memory, data)
     scale = setting.renderer.scale
     report = {
         "options": asdict(options),
+        "memory": 0 if memory is None else len(memory.keys),
         "held_out_views": len(degrees),
         "median_deg": float(np.median(degrees)),
         "median_distance": float(np.median(lengths)) * scale.length,
@@ -154,7 +222,7 @@ def trained_network(
         "within_15_deg": float((degrees < 15).mean()),
     }
     return MapNetwork(
-        network.eval(), source_views(network, data), setting.renderer.camera, scale, report
+        network, source_views(network, data), setting.renderer.camera, scale, report, memory
     )
 
 
