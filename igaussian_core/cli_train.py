@@ -38,6 +38,9 @@ def train_map(
     ] = "random",
     sources: Annotated[int, typer.Option(help="source views", min=1, max=64)] = 16,
     bank: Annotated[int, typer.Option(help="rendered views kept at a time", min=32)] = 6000,
+    memory: Annotated[
+        int | None, typer.Option(help="views of known pose kept to predict by; 0: none", min=0)
+    ] = None,
     seed: SeedOption = 0,
     curves: CurvesOption = None,
     tensorboard: BoardOption = None,
@@ -58,7 +61,7 @@ def train_map(
     with progress_bars() as progress:
         trained, curve = train_map_network(
             package, _start(start, attention), options, sources=sources, bank=bank,
-            threads=threads,
+            memory=memory, threads=threads,
             checkpoint=map_path.with_name(map_path.name + ".training"), progress=Stages(progress),
         )  # fmt: skip
     with_network(map_path, trained.data())

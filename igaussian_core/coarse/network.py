@@ -83,7 +83,7 @@ class MapNetwork:
             views = SourceViews(
                 **{f: torch.from_numpy(data.tensors[_VIEWS + f]) for f in SourceViews._fields}
             )
-            memory = _memory_of(data.tensors)
+            memory = _memory_of(data.tensors, 4 * network.backbone.channels)
             camera = Camera(**dict(zip(_CAMERA, meta["camera"], strict=True)))
             scale = PoseScale(tuple(meta["scale"]["centre"]), float(meta["scale"]["length"]))
         except (KeyError, TypeError, ValueError) as error:
@@ -163,11 +163,19 @@ class NetworkLocalizer:
 _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 
 
-def _memory_of(tensors: dict[str, NDArray[Any]]) -> ViewMemory | None:
+def _memory_of(tensors: dict[str, NDArray[Any]], features: int) -> ViewMemory | None:
+    """Raises KeyError where a part is missing, ValueError where one does not fit."""
     names = [_MEMORY + name for name in ViewMemory._fields]
     if not any(name in tensors for name in names):
         return None
-    return ViewMemory(*(torch.from_numpy(tensors[name]) for name in names))
+    memory = ViewMemory(*(torch.from_numpy(tensors[name]) for name in names))
+    views, dimensions = memory.keys.shape
+    wanted = ((features,), (features, dimensions), (views, dimensions), (1,), (views, 12), (12,),
+              (views, 12))  # fmt: skip
+    for name, part, shape in zip(names, memory, wanted, strict=True):
+        if part.shape != shape or not torch.isfinite(part).all():
+            raise ValueError(f"{name}: not finite numbers of shape {shape}")
+    return memory
 
 
 def _weights(network: PoseNetwork) -> dict[str, Tensor]:

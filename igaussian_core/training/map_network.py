@@ -126,7 +126,7 @@ def train_map_network(
     *,
     sources: int = 16,
     bank: int = BANK,
-    memory: int = MEMORY,
+    memory: int | None = None,
     threads: int = 2,
     checkpoint: Path | None = None,
     progress: Progress = lambda stage, done, of: None,
@@ -134,7 +134,8 @@ def train_map_network(
     """Train a network, from `start`'s weights, on views that a compiled map renders of itself.
 
     Args:
-        memory: views whose poses are kept to predict by; 0: none, the network's heads do.
+        memory: views whose poses are kept to predict by; 0: none, the network's heads do; None:
+            MEMORY.
 
     Raises:
         MapError: the map shows next to nothing from where views are drawn.
@@ -145,7 +146,8 @@ def train_map_network(
     data = training_map(package.manifest.name, setting, bank, options.seed, progress)
     trainer = Trainer(start, [data], options, checkpoint, threads)
     curve = trainer.run(progress)
-    views = remember(trainer.network, data, setting, memory, options.seed, progress)
+    count = MEMORY if memory is None else memory
+    views = remember(trainer.network, data, setting, count, options.seed, progress)
     return trained_network(trainer.network, data, setting, options, views), curve
 
 

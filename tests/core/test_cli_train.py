@@ -25,6 +25,11 @@ def run(*arguments: object) -> str:
     return " ".join(result.output.split())
 
 
+@pytest.fixture(autouse=True)
+def few_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("igaussian_core.training.map_network.MEMORY", 96)
+
+
 @pytest.fixture
 def copied(room_igmap: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(room_igmap, tmp_path / "room.igmap"))

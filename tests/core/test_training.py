@@ -39,6 +39,7 @@ from igaussian_core.training.bank import Bank, draw_views
 from igaussian_core.training.curves import plot_curve, write_tensorboard
 from igaussian_core.training.map_network import (
     Setting,
+    remember,
     setting_of,
     train_map_network,
     trained_network,
@@ -162,7 +163,8 @@ def learned(package: MapPackage, setting: Setting) -> tuple[MapNetwork, Trainer]
     data = training_map("room", setting, 192, 0, held_out=48)
     trainer = Trainer(PoseNetwork(SMALL), [data], OPTIONS)
     trainer.run()
-    return trained_network(trainer.network, data, setting, OPTIONS), trainer
+    memory = remember(trainer.network, data, setting, 400, seed=0)
+    return trained_network(trainer.network, data, setting, OPTIONS, memory), trainer
 
 
 def test_training_lowers_the_error_on_views_it_has_not_seen(
@@ -234,15 +236,44 @@ def test_a_map_keeps_its_network(
     assert again.report == trained.report and again.camera == trained.camera
 
 
-def test_hypotheses_differ_from_each_other(learned: tuple[MapNetwork, Trainer]) -> None:
+@pytest.mark.parametrize("head", ["memory", "attention"])
+def test_hypotheses_differ_from_each_other(
+    learned: tuple[MapNetwork, Trainer], head: str
+) -> None:
     trained, _ = learned
     image = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
-    found = list(NetworkLocalizer(trained, 4).hypotheses(image, trained.camera.resized(320, 240)))
+    camera = trained.camera.resized(320, 240)
+    found = list(NetworkLocalizer(trained, 4, head).hypotheses(image, camera))
     assert 1 <= len(found) <= 4 and all(h.source == "network" for h in found)
     assert all(is_rigid(h.T_scene_cam) for h in found)
 
 
-@pytest.mark.parametrize("damage", ["missing", "extra", "shape", "format"])
+def test_the_memory_knows_the_map_better_than_the_heads(
+    learned: tuple[MapNetwork, Trainer], setting: Setting
+) -> None:
+    """After seconds of training, which are too few for the heads."""
+    trained, trainer = learned
+    by_heads = np.median(held_out_errors(trained.network, trainer.maps[0])[0])
+    assert trained.report["memory"] == 400
+    assert trained.report["median_deg"] < 0.8 * by_heads
+    assert not trained.network.training
+
+
+def test_an_old_network_without_a_memory_predicts_by_its_heads(
+    learned: tuple[MapNetwork, Trainer]
+) -> None:
+    data = learned[0].data()
+    tensors = {k: v for k, v in data.tensors.items() if not k.startswith("memory.")}
+    old = MapNetwork.from_data(NetworkData(tensors, data.meta), "here")
+    assert old.memory is None
+    image, camera = np.full((240, 320, 3), 90, np.uint8), old.camera.resized(320, 240)
+    asked = [NetworkLocalizer(old, 1, head).hypotheses(image, camera)
+             for head in ("memory", "attention")]  # fmt: skip
+    a, b = (next(hypotheses).T_scene_cam for hypotheses in asked)
+    assert np.array_equal(a, b)
+
+
+@pytest.mark.parametrize("damage", ["missing", "extra", "shape", "memory", "nan", "format"])
 def test_damaged_networks_are_refused(
     learned: tuple[MapNetwork, Trainer], damage: str
 ) -> None:
@@ -250,6 +281,10 @@ def test_damaged_networks_are_refused(
     tensors, meta = dict(data.tensors), dict(data.meta)
     if damage == "missing":
         del tensors["network.decode.weight"]
+    elif damage == "memory":
+        del tensors["memory.coefficients"]
+    elif damage == "nan":
+        tensors["memory.width"] = np.array([np.nan], np.float32)
     elif damage == "extra":
         tensors["network.more"] = np.zeros(3, np.float32)
     elif damage == "shape":
@@ -284,8 +319,11 @@ def test_the_shipped_checkpoint_opens_and_is_small() -> None:
 def test_training_may_be_left_out(package: MapPackage) -> None:
     options = TrainOptions(steps=0)
     torch.manual_seed(0)
-    trained, curve = train_map_network(package, PoseNetwork(SMALL), options, sources=4, bank=8)
+    trained, curve = train_map_network(
+        package, PoseNetwork(SMALL), options, sources=4, bank=8, memory=0
+    )
     assert curve.steps == [] and trained.views.features.shape[:2] == (1, 4)
+    assert trained.memory is None and trained.report["memory"] == 0
 
 
 def test_curves(learned: tuple[MapNetwork, Trainer], tmp_path: Path) -> None:
