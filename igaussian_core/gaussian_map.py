@@ -69,6 +69,11 @@ class GaussianMap:
             _rasterizer=None,
         )  # fmt: skip
 
+    def for_small_images(self) -> GaussianMap:
+        """The same Gaussians with the low-pass filter's opacity compensation: in images much
+        smaller than those that a map was trained with, they would swell without it."""
+        return dataclasses.replace(self, antialiased=True, _rasterizer=None)
+
     def rasterizer(self) -> Rasterizer:
         """The renderer of this map, packed on first use; not for two threads at once."""
         if self._rasterizer is None:

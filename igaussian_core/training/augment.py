@@ -53,11 +53,11 @@ def augmented(rgba: Tensor, background: Tensor, generator: torch.Generator) -> T
 
 
 def _blurred(rgba: Tensor, chance: Tensor) -> Tensor:
-    """Uint8 images, most of them as they are, the others blurred over 3 or 5 pixels."""
+    """Uint8 images, most of them as they are, the others blurred over 3 pixels, few over 5."""
     images = rgba.numpy().copy()
     for image, draw in zip(images, chance.flatten().tolist(), strict=True):
-        if draw > 0.6:
-            side = 3 if draw < 0.9 else 5
+        if draw > 0.85:
+            side = 3 if draw < 0.97 else 5
             image[:] = cv2.blur(image, (side, side))
     return torch.from_numpy(images)
 

@@ -86,7 +86,8 @@ def _setting(made: ProceduralMap, rng: np.random.Generator, threads: int) -> Set
         )
     focal = 0.5 * _SIDE / np.tan(0.5 * np.radians(degrees))
     camera = Camera(_SIDE, _SIDE, focal, focal, 0.5 * (_SIDE - 1), 0.5 * (_SIDE - 1))
-    renderer = ViewRenderer(made.gmap, camera, PoseScale(centre, length), covered, threads)
+    gmap = made.gmap.for_small_images()
+    renderer = ViewRenderer(gmap, camera, PoseScale(centre, length), covered, threads)
     return Setting(renderer, sampler, sources, torch.tensor(background, dtype=torch.float32))
 
 

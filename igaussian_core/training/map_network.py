@@ -37,7 +37,7 @@ from igaussian_core.views import spherical_views, spread_indices
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
-OPTIONS = TrainOptions(steps=2500)
+OPTIONS = TrainOptions(steps=2000)
 BANK = 6000
 MEMORY = 12000
 HELD_OUT = 256
@@ -70,8 +70,9 @@ def setting_of(package: MapPackage, sources: int = 16, threads: int = 2) -> Sett
     camera = canonical_camera(Camera(int(width), int(height), fx, fy, cx, cy))
     is_object = sphere.kind == "object"
     renderer = ViewRenderer(
-        package.gaussians, camera, scale, 0.0 if is_object else _MIN_COVERED, threads
-    )
+        package.gaussians.for_small_images(), camera, scale, 0.0 if is_object else _MIN_COVERED,
+        threads,
+    )  # fmt: skip
     sampler = PoseSampler(sphere, scale.length, known, _NEAR_KNOWN[sphere.kind])
     if is_object:
         poses = object_sources(sphere, sources)
