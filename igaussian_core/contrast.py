@@ -9,13 +9,23 @@ from numpy.typing import NDArray
 Gray = NDArray[np.uint8]
 
 _SIGMA = 6.0  # pixels of the neighbourhood that is normalised
+_SHRINK = 4  # mean and deviation are smooth: a quarter of the resolution tells them
 _NOISE = 4.0  # grey levels of contrast below which nothing is amplified
 
 
 def normalize_contrast(image: NDArray[np.uint8]) -> Gray:
     """Grey image [H, W] of uint8 RGB [H, W, 3] with local mean 128 and local deviation 40."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    mean = cv2.GaussianBlur(gray, (0, 0), _SIGMA)
-    variance = cv2.GaussianBlur(gray * gray, (0, 0), _SIGMA) - mean * mean
-    deviation = np.sqrt(np.maximum(variance, 0)) + _NOISE
-    return np.asarray(np.clip((gray - mean) / deviation * 40 + 128, 0, 255), np.uint8)
+    height, width = gray.shape
+    small = (max(width // _SHRINK, 1), max(height // _SHRINK, 1))
+    mean, square = (
+        cv2.GaussianBlur(
+            cv2.resize(x, small, interpolation=cv2.INTER_AREA), (0, 0), _SIGMA / _SHRINK
+        )
+        for x in (gray, gray * gray)
+    )
+    gain = 40 / (np.sqrt(np.maximum(square - mean * mean, 0)) + _NOISE)
+    gray -= cv2.resize(mean, (width, height))
+    gray *= cv2.resize(gain, (width, height))
+    gray += 128
+    return np.asarray(np.clip(gray, 0, 255, out=gray), np.uint8)

@@ -340,7 +340,7 @@ class Refiner:
 
 def to_u8(rgb: Image) -> NDArray[np.uint8]:
     """uint8 image of a render in [0, 1]."""
-    return np.asarray(np.clip(rgb * 255 + 0.5, 0, 255), np.uint8)
+    return np.asarray(cv2.convertScaleAbs(rgb, alpha=255), np.uint8)  # rounds and saturates
 
 
 def _soft(gray: Gray) -> Image:

@@ -124,6 +124,20 @@ def test_the_cells_scene_coordinates_project_to_the_cells(setting: Setting) -> N
         assert np.allclose(scale.scene(views.position[index]), T[index, :3, 3], atol=1e-5)
 
 
+def test_training_views_look_like_large_images_made_small(
+    package: MapPackage, setting: Setting
+) -> None:
+    camera = setting.renderer.camera
+    large = camera.resized(4 * camera.width, 4 * camera.height)
+    T_cam_scene = inverse(setting.source_poses[0])
+    rgb, _, _ = package.gaussians.render(large, T_cam_scene)
+    wanted = rgb.reshape(camera.height, 4, camera.width, 4, 3).mean((1, 3))
+    swollen, compensated = (
+        gmap.render(camera, T_cam_scene)[0] for gmap in (package.gaussians, setting.renderer.gmap)
+    )
+    assert np.abs(compensated - wanted).mean() < 0.8 * np.abs(swollen - wanted).mean()
+
+
 def test_views_that_show_nothing_are_not_used(setting: Setting) -> None:
     away = dataclasses.replace(setting.renderer, min_covered=1.1)
     with pytest.raises(MapError, match="shows nothing"):
