@@ -156,25 +156,26 @@ class Localizer:
 
         In the cascade the network's places are only aligned at first: where that does not
         convince, the landmarks cost less than matching descriptors at a wrong place. They come
-        again, with descriptors, where the landmarks know none.
+        again, with descriptors, where the landmarks know none. Those of a network too rough for
+        alignment come only then.
         """
         if prior is not None:
             if not is_rigid(prior):
                 raise CameraError("prior: expected a rigid 4x4 transform T_map_cam")
             yield Hypothesis(self._T_map_scene.inverse().camera(prior), 0.0, "prior")
-        cascade = self._config.coarse.method == "cascade"
-        asked: list[Hypothesis] = []
-        if self._network is not None:
-            said = self._network.hypotheses(query.image, query.camera)
+        method, network, asked = self._config.coarse.method, self._network, []
+        if network is not None and (method == "network" or not network.rough):
+            said = network.hypotheses(query.image, query.camera)
             for hypothesis in _timed_each(query, said):
                 asked.append(hypothesis)
-                yield replace(hypothesis, describe=not cascade)
-        if self._config.coarse.method != "network":
+                yield replace(hypothesis, describe=method == "network")
+        if method != "network":
             yield from _timed_each(
                 query, self._landmarks.hypotheses(query.features, query.camera)
             )
-        if cascade:
-            yield from asked
+        if method == "cascade" and network is not None:
+            said = iter(asked) if asked else network.hypotheses(query.image, query.camera)
+            yield from _timed_each(query, said)
 
     def _refine(
         self, query: Query, hypothesis: Hypothesis, prior: ArrayLike | None

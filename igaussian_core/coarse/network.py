@@ -32,6 +32,7 @@ FORMAT = "igaussian-pose-network-1"
 _WEIGHT = "network."
 _VIEWS = "views."
 _MEMORY = "memory."
+_ALIGNABLE_DEG = 4.0  # following points finds poses about so far away
 # hypotheses nearer than that to one before them are left out
 _SAME_DEG, _SAME_LENGTHS = 5.0, 0.1
 
@@ -106,6 +107,11 @@ class NetworkLocalizer:
         self._count = hypotheses
         self._memory = trained.memory if head == "memory" else None
         self._rays = cell_rays(trained.camera)[None]
+
+    @property
+    def rough(self) -> bool:
+        """Whether its poses are rarely near enough to be aligned, by its own report."""
+        return float(self._trained.report.get("median_deg", 0.0)) > _ALIGNABLE_DEG
 
     def hypotheses(self, image: Image, camera: Camera) -> Iterator[Hypothesis]:
         """The best guess first, then others that say something else.
