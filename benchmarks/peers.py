@@ -202,7 +202,7 @@ class Scale:
 
 
 SCALES = {
-    "full": Scale(30, 2, 30, 3), "short": Scale(6, 1, 6, 1, references=40),
+    "full": Scale(20, 2, 20, 3), "short": Scale(6, 1, 6, 1, references=40),
     "quick": Scale(2, 1, 2, 1, steps=20, references=20),
 }  # fmt: skip
 
