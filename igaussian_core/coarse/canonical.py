@@ -52,6 +52,21 @@ def resampled(
     )  # fmt: skip
 
 
+def turned(
+    image: NDArray[np.uint8], camera: Camera, rotation: NDArray[np.float64]
+) -> NDArray[np.uint8]:
+    """The image of the camera turned to T_scene_cam @ rotation; its edge goes on where it saw
+    nothing."""
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    return np.asarray(
+        cv2.warpPerspective(
+            image, K @ rotation.T @ np.linalg.inv(K), (camera.width, camera.height),
+            borderMode=cv2.BORDER_REPLICATE,
+        ),
+        np.uint8,
+    )  # fmt: skip
+
+
 def cell_centres(camera: Camera) -> NDArray[np.float64]:
     """Pixels [h, w, 2] of the cells' centres; the first pixel's centre is (0, 0)."""
     u = np.arange(camera.width // STRIDE) * STRIDE + 0.5 * (STRIDE - 1)

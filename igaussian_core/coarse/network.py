@@ -18,7 +18,7 @@ from torch import Tensor
 from igaussian_core.camera import Camera
 from igaussian_core.coarse.attention import NetworkConfig, PoseNetwork, SourceViews
 from igaussian_core.coarse.canonical import cell_rays, resampled, to_tensor
-from igaussian_core.coarse.memory import ViewMemory
+from igaussian_core.coarse.memory import ViewMemory, recall
 from igaussian_core.coarse.pose_scale import PoseScale
 from igaussian_core.errors import MapError
 from igaussian_core.geometry import compose, mean_rotation, pose_error
@@ -133,27 +133,24 @@ class NetworkLocalizer:
                 yield Hypothesis(T_scene_cam, score, "network")
 
     def _poses(self, image: Image, camera: Camera) -> Iterator[tuple[Array, float]]:
-        x = to_tensor(resampled(image, camera, self._trained.camera)[None])
-        with torch.inference_mode():
-            features = self._trained.network.backbone(x)
-        scene = self._trained.scale.scene
-        found = self._attended(features) if self._memory is None else self._remembered(features)
+        trained = self._trained
+        image = resampled(image, camera, trained.camera)
+        found = self._attended(image) if self._memory is None else self._remembered(image)
         for rotation, position, score in found:
-            yield compose(rotation, scene(position)), score
+            yield compose(rotation, trained.scale.scene(position)), score
 
-    def _remembered(self, features: Tensor) -> Iterator[tuple[Array, Array, float]]:
+    def _remembered(self, image: Image) -> Iterator[tuple[Array, Array, float]]:
         assert self._memory is not None
-        with torch.inference_mode():
-            similarity = self._memory.similarity(features)
-            rotations, positions = self._memory.regressed(similarity)
-        yield rotations[0], positions[0], 1.0
-        score, order = similarity[0].sort(descending=True, stable=True)
+        backbone, camera = self._trained.network.backbone, self._trained.camera
+        recalled = recall(self._memory, backbone, image, camera)
+        yield recalled.rotation, recalled.position, 1.0
+        score, order = recalled.similarity.sort(descending=True, stable=True)
         for value, index in zip(score.tolist(), order.tolist(), strict=True):
             yield *self._memory.pose_of(index), value
 
-    def _attended(self, features: Tensor) -> Iterator[tuple[Array, Array, float]]:
+    def _attended(self, image: Image) -> Iterator[tuple[Array, Array, float]]:
         with torch.inference_mode():
-            said = self._trained.network.predict(features, self._rays, self._trained.views)
+            said = self._trained.network(to_tensor(image[None]), self._rays, self._trained.views)
         candidates = said.candidate_rotations, said.candidate_positions
         rotations, positions = (part[0].double().numpy() for part in candidates)
         weights = said.log_weights[0].double().exp().numpy()

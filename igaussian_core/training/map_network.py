@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from igaussian_core.camera import Camera
 from igaussian_core.coarse.attention import PoseNetwork
 from igaussian_core.coarse.canonical import canonical_camera, cell_rays
-from igaussian_core.coarse.memory import ViewMemory, fit_memory, raw_keys
+from igaussian_core.coarse.memory import ViewMemory, fit_memory, raw_keys, recall
 from igaussian_core.coarse.network import MapNetwork
 from igaussian_core.coarse.pose_scale import PoseScale
 from igaussian_core.map_package import MapPackage
 from igaussian_core.sphere import Sphere, sphere_of
 from igaussian_core.training.augment import augmented, composite
-from igaussian_core.training.bank import Bank, ViewRenderer, Views, draw_views
+from igaussian_core.training.bank import Bank, ViewRenderer, draw_views
 from igaussian_core.training.pose_network import (
     Curve,
     Trainer,
@@ -189,19 +189,18 @@ def _raw_keys(network: PoseNetwork, images: torch.Tensor) -> torch.Tensor:
 
 
 def remembered_errors(
-    network: PoseNetwork, memory: ViewMemory, data: TrainingMap
+    network: PoseNetwork, memory: ViewMemory, data: TrainingMap, camera: Camera
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """As `held_out_errors`, of the memory's regression."""
-    degrees, lengths = [], []
     held_out = data.held_out
-    for start in range(0, len(held_out.rgba), _CHUNK):
-        part = Views(*(field[start : start + _CHUNK] for field in held_out))
-        images = composite(part.rgba, data.background[None]).permute(0, 3, 1, 2).contiguous()
-        with torch.no_grad():
-            rotations, positions = memory.regressed(memory.similarity(network.backbone(images)))
-        degrees.append(rotation_error_deg(torch.from_numpy(rotations).float(), part.rotation))
-        lengths.append((torch.from_numpy(positions).float() - part.position).norm(dim=-1))
-    return torch.cat(degrees).numpy(), torch.cat(lengths).numpy()
+    images = (composite(held_out.rgba, data.background[None]) * 255).round().clamp(0, 255)
+    found = [
+        recall(memory, network.backbone, image, camera) for image in images.byte().numpy()
+    ]
+    rotations = torch.from_numpy(np.array([f.rotation for f in found])).float()
+    positions = torch.from_numpy(np.array([f.position for f in found])).float()
+    degrees = rotation_error_deg(rotations, held_out.rotation)
+    return degrees.numpy(), (positions - held_out.position).norm(dim=-1).numpy()
 
 
 def trained_network(
@@ -213,7 +212,7 @@ def trained_network(
     if memory is None:
         degrees, lengths = held_out_errors(network, data)
     else:
-        degrees, lengths = remembered_errors(network, memory, data)
+        degrees, lengths = remembered_errors(network, memory, data, setting.renderer.camera)
     scale = setting.renderer.scale
     report = {
         "options": asdict(options),

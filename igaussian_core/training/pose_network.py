@@ -285,7 +285,8 @@ class Trainer:
         rays = torch.stack([m.rays for m in maps])
         weight_t = torch.tensor([m.lambda_t for m in maps]).repeat_interleave(len(batches[0].rgba))
         network.zero_grad(set_to_none=True)
-        with torch.autocast("cpu", torch.bfloat16):
+        # the cache of weights is the process's: another thread would empty it halfway
+        with torch.autocast("cpu", torch.bfloat16, cache_enabled=False):
             prediction = network(images, rays, views)
         loss = pose_loss(prediction, truth, views, weight_t, self.options, random)
         loss.backward()  # type: ignore[no-untyped-call]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,8 +10,15 @@ from hypothesis import strategies as st
 
 from igaussian_core.camera import Camera
 from igaussian_core.coarse.backbone import STRIDE
-from igaussian_core.coarse.canonical import canonical_camera, cell_centres, cell_rays, resampled
+from igaussian_core.coarse.canonical import (
+    canonical_camera,
+    cell_centres,
+    cell_rays,
+    resampled,
+    turned,
+)
 from igaussian_core.coarse.pose_scale import PoseScale, contracted, expanded
+from igaussian_core.geometry import rotation_from_vector
 
 CAMERAS = [
     Camera(640, 480, 525.0, 525.0, 319.5, 239.5),
@@ -83,3 +91,18 @@ def test_units_of_a_map() -> None:
     scale = PoseScale((1.0, 2.0, 3.0), 4.0)
     assert np.allclose(scale.normalized([5.0, 2.0, 3.0]), [1, 0, 0])
     assert np.allclose(scale.scene(scale.normalized([[7.0, -2.0, 9.0]])), [[7, -2, 9]])
+
+
+def test_a_turned_image_is_what_the_turned_camera_sees() -> None:
+    camera = Camera(160, 128, 150.0, 150.0, 79.5, 63.5)
+    point = np.array([0.1, -0.05, 1.0])
+    rotation = rotation_from_vector(np.radians([4.0, -3.0, 8.0]))
+    image = np.zeros((128, 160, 3), np.uint8)
+    u, v = np.rint(camera.project(point[None])[0]).astype(int)
+    cv2.circle(image, (int(u), int(v)), 4, (255, 255, 255), -1)
+    seen = turned(image, camera, rotation)
+    row, column = np.array(np.nonzero(seen[..., 0] > 127)).mean(1)
+    # a point of the scene in the turned camera: T_scene_cam @ rotation
+    wanted = camera.project((rotation.T @ point)[None])[0]
+    assert np.abs(wanted - (column, row)).max() < 0.7
+    assert np.array_equal(turned(image, camera, np.eye(3)), image)

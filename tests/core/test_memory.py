@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from igaussian_core.coarse.memory import ViewMemory, fit_memory, raw_keys
+from igaussian_core.camera import Camera
+from igaussian_core.coarse.memory import ViewMemory, _agreeing, fit_memory, raw_keys, recall
 from igaussian_core.errors import MapError
 from igaussian_core.geometry import is_rigid, rotation_from_vector
 
@@ -55,6 +56,34 @@ def test_what_resembles_nothing_gets_a_pose_all_the_same(memory: ViewMemory) -> 
     rotations, positions = memory.regressed(similarity)
     assert similarity.max() < 1e-3
     assert is_rigid(np.block([[rotations[0], positions[0][:, None]], [np.zeros((1, 3)), 1]]))
+
+
+class Tint(torch.nn.Module):
+    """A backbone that sees the mean colour only, so that every turn of a plain image is alike."""
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return images.mean((2, 3), keepdim=True).repeat(1, 1, 2, 2)
+
+
+def test_answers_of_turned_images_are_turned_back_and_averaged() -> None:
+    """Positions follow colour; the camera's turns, which no colour shows, cancel."""
+    colours = torch.rand(400, 3, generator=torch.Generator().manual_seed(0))
+    keys = raw_keys(Tint()(colours[:, :, None, None].expand(-1, -1, 8, 8)))
+    memory = fit_memory(keys, torch.eye(3).expand(400, 3, 3), colours, 8)
+    image = np.full((32, 32, 3), (51, 102, 153), np.uint8)
+    camera = Camera(32, 32, 40.0, 40.0, 15.5, 15.5)
+    recalled = recall(memory, Tint(), image, camera)
+    assert np.allclose(recalled.position, [0.2, 0.4, 0.6], atol=0.03)
+    assert np.degrees(np.arccos((np.trace(recalled.rotation) - 1) / 2)) < 1.0
+    assert recalled.similarity.shape == (400,)
+
+
+def test_an_answer_far_from_the_others_is_left_out() -> None:
+    rotations = np.array([rotation_from_vector([0.01 * i, 0, 0]) for i in range(7)])
+    positions = np.zeros((7, 3))
+    rotations[4], positions[4] = rotation_from_vector([0, 2.5, 0]), (3, 0, 0)
+    assert _agreeing(rotations, positions).tolist() == [True] * 4 + [False] + [True] * 2
+    assert _agreeing(rotations[:1].repeat(7, 0), positions[:7] * 0).all()
 
 
 def test_views_all_alike() -> None:
