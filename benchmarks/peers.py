@@ -108,6 +108,9 @@ SOLVER = Config.from_flat(
     {**_UNLIMITED, "refine.solver": "paper", "refine.scale": "depth"}
 )
 SOLVER_VIT = Config.from_flat({**_UNLIMITED, "refine.solver": "paper", "refine.scale": "vit"})
+HEADS = Config.from_flat(
+    {**_UNLIMITED, "coarse.method": "network", "coarse.network_head": "attention"}
+)
 SIFT = dataclasses.replace(CONFIG, features=dataclasses.replace(CONFIG.features, matcher="sift"))
 
 
@@ -169,12 +172,14 @@ def _staged(refine: Callable[..., Any], **settings: Any) -> Callable[[Case], Est
 
 
 ABLATION = (
-    Method("paper: network + WPM (stage one)", lambda c: CoarseOnly(_with_network(c), CONFIG)),
+    Method("paper: network + WPM (stage one)", lambda c: CoarseOnly(_with_network(c), HEADS)),
     Method("paper: + XFeat, RANSAC, scale by depth", _paper(solver="paper", scale="depth")),
     Method("paper: + XFeat, RANSAC, scale by ViT", _paper(solver="paper", scale="vit")),
     Method("paper's stage one + XFeat, PnP in place of RANSAC and ViT", _paper()),
     PAPERS_SOLVER,
     PAPERS_SOLVER_VIT,
+    Method("ours: network with memory (stage one)",
+           lambda c: CoarseOnly(_with_network(c), CONFIG)),
     Method("ours: landmarks alone (stage one)", lambda c: CoarseOnly(c.package, CONFIG)),
     Method("ours: + matching and PnP, one round",
            _staged(lambda r, q, T: r.match(q, T), rounds=1)),
