@@ -108,9 +108,8 @@ SOLVER = Config.from_flat(
     {**_UNLIMITED, "refine.solver": "paper", "refine.scale": "depth"}
 )
 SOLVER_VIT = Config.from_flat({**_UNLIMITED, "refine.solver": "paper", "refine.scale": "vit"})
-HEADS = Config.from_flat(
-    {**_UNLIMITED, "coarse.method": "network", "coarse.network_head": "attention"}
-)
+_HEADS = {**_UNLIMITED, "coarse.method": "network", "coarse.network_head": "attention"}
+HEADS = Config.from_flat(_HEADS)
 SIFT = dataclasses.replace(CONFIG, features=dataclasses.replace(CONFIG.features, matcher="sift"))
 
 
@@ -125,10 +124,8 @@ def _with_network(case: Case) -> MapPackage:
 def _paper(**refine: Any) -> Callable[[Case], Estimator]:
     """The paper's stage one, then descriptors matched once and a solver. No wheel brings LoFTR's
     weights, so XFeat finds the matches."""
-    flat = {"coarse.method": "network", "coarse.network_head": "attention", "refine.rounds": 1}
-    config = Config.from_flat(
-        {**_UNLIMITED, **flat, **{f"refine.{k}": v for k, v in refine.items()}}
-    )
+    settings = {f"refine.{k}": v for k, v in {"rounds": 1, **refine}.items()}
+    config = Config.from_flat({**_HEADS, **settings})
     return lambda c: Staged(_with_network(c), config, lambda r, q, T: r.match(q, T))
 
 

@@ -1,6 +1,6 @@
 """Stage one alone: what the pose network reaches on each map, and what each of its parts adds.
 
-    python benchmarks/stage_one.py [--json out.json] [--steps 3000] [--short-steps 300]
+    python benchmarks/stage_one.py [--json out.json] [--steps 2000] [--short-steps 300]
                                    [--work folder] [--only maps|ablation|views]
 
 `maps`: per map the shipped joint weights without training, the network trained on the map from

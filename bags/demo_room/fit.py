@@ -9,8 +9,7 @@ mapping run and more of their kind, none of the drive's: those added keep clear 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from igaussian_core import Camera
 from igaussian_core.render.torch_op import render
+from igaussian_core.torch_threads import one_torch_thread
 
 from . import sensor
 from .drive import Drive, image_times, mapping_poses, optical
@@ -164,7 +164,7 @@ def fit(
     decay = torch.optim.lr_scheduler.ExponentialLR(adam, LAST_RATE ** (1 / steps))
     rng, rounds = np.random.default_rng(78), -(-steps // len(views))
     order = np.concatenate([rng.permutation(len(views)) for _ in range(rounds)])
-    with _one_torch_thread():
+    with one_torch_thread():
         for step in range(steps):
             loss = _loss(views[order[step]], free)
             adam.zero_grad()
@@ -175,17 +175,6 @@ def fit(
             if step % 50 == 0 or step == steps - 1:
                 report(f"step {step + 1} of {steps}: loss {loss.item():.4f}")
     return free.fitted(room)
-
-
-@contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """The renderer's own threads do the work; torch's would only wait beside them, busily."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _loss(view: View, free: FreeMap) -> Tensor:

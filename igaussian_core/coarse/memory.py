@@ -32,7 +32,7 @@ from igaussian_core.geometry import mean_rotation, nearest_rotation, rotation_fr
 
 Array = NDArray[np.float64]
 
-_GRID = 2  # features are averaged over so many by so many parts of the image
+GRID = 2  # features are averaged over so many by so many parts of the image
 _RIDGE = 0.001  # of the kernel's value at zero distance
 _WIDTH = 1.0  # of the kernel, in median distances of keys
 _LARGEST_RIDGE = 1.0
@@ -120,7 +120,7 @@ def _agreeing(rotations: Array, positions: Array) -> NDArray[np.bool_]:
 
 def raw_keys(features: Tensor) -> Tensor:
     """[B, C * 4], the means of the backbone's features [B, C, h, w] over an image's quarters."""
-    return F.adaptive_avg_pool2d(features.float(), _GRID).flatten(1)
+    return F.adaptive_avg_pool2d(features.float(), GRID).flatten(1)
 
 
 @torch.no_grad()

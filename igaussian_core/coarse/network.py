@@ -18,7 +18,7 @@ from torch import Tensor
 from igaussian_core.camera import Camera
 from igaussian_core.coarse.attention import NetworkConfig, PoseNetwork, SourceViews
 from igaussian_core.coarse.canonical import cell_rays, resampled, to_tensor
-from igaussian_core.coarse.memory import ViewMemory, recall
+from igaussian_core.coarse.memory import GRID, ViewMemory, recall
 from igaussian_core.coarse.pose_scale import PoseScale
 from igaussian_core.errors import MapError
 from igaussian_core.geometry import compose, mean_rotation, pose_error
@@ -84,7 +84,7 @@ class MapNetwork:
             views = SourceViews(
                 **{f: torch.from_numpy(data.tensors[_VIEWS + f]) for f in SourceViews._fields}
             )
-            memory = _memory_of(data.tensors, 4 * network.backbone.channels)
+            memory = _memory_of(data.tensors, GRID**2 * network.backbone.channels)
             camera = Camera(**dict(zip(_CAMERA, meta["camera"], strict=True)))
             scale = PoseScale(tuple(meta["scale"]["centre"]), float(meta["scale"]["length"]))
         except (KeyError, TypeError, ValueError) as error:
@@ -106,6 +106,8 @@ class NetworkLocalizer:
         self._trained = trained
         self._count = hypotheses
         self._memory = trained.memory if head == "memory" else None
+        if self._memory is not None:  # widened once, not for every frame
+            self._memory = self._memory._replace(keys=self._memory.keys.float())
         self._rays = cell_rays(trained.camera)[None]
 
     @property

@@ -152,6 +152,7 @@ def train_map_network(
     return trained_network(trainer.network, data, setting, options, views), curve
 
 
+@torch.no_grad()
 def remember(
     network: PoseNetwork, data: TrainingMap, setting: Setting, count: int, seed: int,
     progress: Progress = lambda stage, done, of: None,
@@ -175,17 +176,12 @@ def remember(
                 setting.renderer, setting.sampler, rng, min(_CHUNK, count - done)
             )
         images = augmented(views.rgba, setting.background, random)
-        keys.append(_raw_keys(network, images))
+        keys.append(raw_keys(network.backbone(images)))
         rotations.append(views.rotation)
         positions.append(views.position)
         done += len(views.rgba)
         progress("remembered views", done, count)
     return fit_memory(torch.cat(keys), torch.cat(rotations), torch.cat(positions))
-
-
-@torch.no_grad()
-def _raw_keys(network: PoseNetwork, images: torch.Tensor) -> torch.Tensor:
-    return raw_keys(network.backbone(images))
 
 
 def remembered_errors(

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ from torch import Tensor, nn
 
 from igaussian_core.coarse.attention import PoseNetwork, Prediction, SourceViews
 from igaussian_core.errors import ConfigError
+from igaussian_core.torch_threads import one_torch_thread
 from igaussian_core.training.augment import augmented, composite
 from igaussian_core.training.bank import Bank, Views
 
@@ -224,7 +224,7 @@ class Trainer:
         for network in self._copies:
             network.train()
         with (
-            _one_thread_an_operation(), ThreadPoolExecutor(1) as renderer,
+            one_torch_thread(), ThreadPoolExecutor(1) as renderer,
             ThreadPoolExecutor(len(self._copies), initializer=torch.set_num_threads,
                                initargs=(1,)) as workers,
         ):  # fmt: skip
@@ -342,16 +342,6 @@ def _sharing_copy(network: PoseNetwork) -> PoseNetwork:
     for ours, theirs in zip(network.parameters(), other.parameters(), strict=True):
         theirs.data = ours.data
     return other
-
-
-@contextmanager
-def _one_thread_an_operation() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def source_views(network: PoseNetwork, training_map: TrainingMap) -> SourceViews:

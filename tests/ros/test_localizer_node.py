@@ -96,8 +96,10 @@ class Camera(Listener):
 @pytest.fixture(scope="module")
 def node(ros, corner, tmp_path_factory):
     folder = tmp_path_factory.mktemp("node")
-    # images may wait long on a busy machine
-    with node_process(folder, map_path=corner.map_path, runtime__max_image_age_s=5.0) as process:
+    # on a busy machine images may wait long, and frames take long
+    with node_process(
+        folder, map_path=corner.map_path, runtime__max_image_age_s=5.0, runtime__budget_ms=60000.0
+    ) as process:
         assert process.says("loaded in", 60), process.log
         yield process
         assert process.end() == 0, process.log
@@ -228,9 +230,7 @@ def test_another_scene_gives_no_pose_and_says_so(camera, node, corner):
     for T_map_cam in corner.poses[::13]:
         stamp_ns = camera.image(other.photo(T_map_cam))
         values = camera.answer(stamp_ns)
-        # timeout: a busy machine did not come to look at every place
-        lost = ("no_hypothesis", "too_few_matches", "inconsistent", "timeout")
-        assert values["status"] in lost, values
+        assert values["status"] in ("no_hypothesis", "too_few_matches", "inconsistent"), values
         assert values["reason"]
         time.sleep(0.2)
         assert camera.poses_at(stamp_ns) == []
