@@ -69,6 +69,10 @@ class CoarseConfig:
     max_reprojection_px: float = _option(8.0, "inlier threshold of landmark PnP in pixels", 0.5, 64)
     min_inliers: int = _option(12, "least inliers of a hypothesis", 4, 1000)
     hypotheses: int = _option(3, "hypotheses handed to stage two", 1, 16)
+    rival_share: float = _option(
+        0.5, "share of a place's inliers with which another one is its rival: it is refined too, "
+        "and neither is accepted where both convince alike; 2: no rivals", 0, 2
+    )  # fmt: skip
     network_head: str = _option(
         "memory",
         "memory: regression among thousands of views of known pose; attention: candidates and "

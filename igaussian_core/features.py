@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from igaussian_core.config import FeatureConfig
 from igaussian_core.errors import WeightsError
+from igaussian_core.torch_cpu import has_native_bfloat16
 
 log = logging.getLogger(__name__)
 
@@ -219,12 +220,6 @@ def _lighterglue_config(light_glue: Any) -> dict[str, Any]:
     """kornia's settings for XFeat, without pruning: on a CPU it costs more than it saves."""
     settings = {**light_glue.features["xfeat"], "weights": None, "width_confidence": -1}
     return {**settings, "mp": has_native_bfloat16()}
-
-
-def has_native_bfloat16() -> bool:
-    """bfloat16 matching is 1.6 times faster where the CPU computes in it, slower elsewhere."""
-    query = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
-    return bool(query is not None and query())
 
 
 def _lighterglue_state(model: Any) -> dict[str, torch.Tensor]:

@@ -17,9 +17,11 @@ class Hypothesis:
         score: the larger the better; comparable among hypotheses of one source only.
         source: "prior", "landmarks", "network".
         describe: whether stage two may match descriptors where alignment does not convince.
+        rival: another place, 4x4, that explains nearly as much of the image; None: none known.
     """
 
     T_scene_cam: NDArray[np.float64]
     score: float
     source: str
     describe: bool = True
+    rival: NDArray[np.float64] | None = None

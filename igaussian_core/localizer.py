@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,7 +17,7 @@ from igaussian_core.coarse.network import MapNetwork, NetworkLocalizer
 from igaussian_core.config import Config
 from igaussian_core.errors import CameraError, MapError
 from igaussian_core.features import Matcher, make_matcher
-from igaussian_core.geometry import Sim3, is_rigid
+from igaussian_core.geometry import Sim3, is_rigid, pose_error
 from igaussian_core.hypothesis import Hypothesis
 from igaussian_core.map_package import Manifest, MapPackage, open_package
 from igaussian_core.query import Query
@@ -29,6 +28,8 @@ from igaussian_core.timing import StageTimer
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
+
+_SAME_PLACE = 0.1  # image widths between poses that are no rivals
 
 
 class Localizer:
@@ -109,6 +110,8 @@ class Localizer:
             refinement = self._refine(query, hypothesis, prior)
             result = self._result(hypothesis, refinement)
             if result.ok:
+                if timer.elapsed_ms() <= self._config.runtime.budget_ms:
+                    result = self._unless_ambiguous(query, hypothesis, refinement, result)
                 return _timed(result, timer)
             if result.inliers >= failure.inliers:
                 failure = result
@@ -187,6 +190,25 @@ class Localizer:
             prior=None if prior is None else self._T_map_scene.inverse().camera(prior),
             describe=hypothesis.describe,
         )
+
+    def _unless_ambiguous(
+        self, query: Query, hypothesis: Hypothesis, found: Refinement, result: LocalizationResult
+    ) -> LocalizationResult:
+        """An accepted pose; its rival where that convinces more, neither where both do alike."""
+        rival = hypothesis.rival
+        if rival is None or found.shift(query.camera, rival) < _SAME_PLACE:
+            return result
+        hypothesis = replace(hypothesis, T_scene_cam=rival)
+        other_found = self._refine(query, hypothesis, None)
+        other = self._result(hypothesis, other_found)
+        if not other.ok or other_found.T_scene_cam is None:
+            return result
+        if found.shift(query.camera, other_found.T_scene_cam) < _SAME_PLACE:
+            return result
+        weaker, stronger = sorted((result, other), key=lambda r: r.inliers)
+        if weaker.inliers < self._config.coarse.rival_share * stronger.inliers:
+            return stronger
+        return _ambiguous(stronger, weaker)
 
     def _result(self, hypothesis: Hypothesis, refinement: Refinement) -> LocalizationResult:
         evidence = refinement.evidence
@@ -286,9 +308,24 @@ def _contrast(image: NDArray[np.uint8]) -> float:
     return float(np.std(cv2.resize(gray, (64, 48), interpolation=cv2.INTER_AREA)))
 
 
+def _ambiguous(result: LocalizationResult, other: LocalizationResult) -> LocalizationResult:
+    """Neither of two accepted poses; the more alike they are, the less confident."""
+    assert result.T_map_cam is not None and other.T_map_cam is not None
+    angle, distance = pose_error(result.T_map_cam, other.T_map_cam)
+    return replace(
+        result,
+        status=Status.INCONSISTENT,
+        reason=f"two places fit alike, {distance:.2g} m and {angle:.0f} degrees apart: "
+        f"{result.inliers} and {other.inliers} inliers",
+        T_map_cam=None,
+        covariance=None,
+        confidence=min(result.confidence, 0.5 * (1 - other.inliers / result.inliers)),
+    )
+
+
 def _out_of_time(best: LocalizationResult, budget_ms: float) -> LocalizationResult:
     reason = f"{budget_ms:.0f} ms were over before all places were tried; the best: {best.reason}"
-    return dataclasses.replace(best, status=Status.TIMEOUT, reason=reason)
+    return replace(best, status=Status.TIMEOUT, reason=reason)
 
 
 def _timed(result: LocalizationResult, timer: StageTimer) -> LocalizationResult:

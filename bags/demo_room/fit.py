@@ -19,7 +19,7 @@ from torch import Tensor
 
 from igaussian_core import Camera
 from igaussian_core.render.torch_op import render
-from igaussian_core.torch_threads import one_torch_thread
+from igaussian_core.torch_cpu import one_torch_thread
 
 from . import sensor
 from .drive import Drive, image_times, mapping_poses, optical

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -34,13 +35,27 @@ class LandmarkLocalizer:
     def hypotheses(self, features: Features, camera: Camera) -> Iterator[Hypothesis]:
         """Poses in order of their inliers, at most `config.hypotheses`; found as asked for.
 
+        A place of which the next one has `config.rival_share` of the inliers has a rival.
+
         Args:
             features: the frame's, best score first.
             camera: its pinhole camera.
         """
+        places = self._places(features, camera)
+        place = next(places, None)
+        for _ in range(self._config.hypotheses):
+            if place is None:
+                return
+            following = next(places, None)
+            if following and following.score >= self._config.rival_share * place.score:
+                place = replace(place, rival=following.T_scene_cam)
+            yield place
+            place = following
+
+    def _places(self, features: Features, camera: Camera) -> Iterator[Hypothesis]:
         views = self.rank_views(features)[: self._config.top_views]
         query, points = self._matches(features, views)
-        for _ in range(self._config.hypotheses):
+        while len(query) >= self._config.min_inliers:
             uv = features.uv[query]
             solution = solve_pnp(camera, uv, points, self._config.max_reprojection_px)
             if solution is None or solution.inliers.sum() < self._config.min_inliers:

@@ -18,10 +18,10 @@ from igaussian_core.features import (
     Matcher,
     SiftMatcher,
     XFeatMatcher,
-    has_native_bfloat16,
     load_strictly,
 )
 from igaussian_core.query import Query
+from igaussian_core.torch_cpu import has_native_bfloat16
 
 Pixels = NDArray[np.float32]
 Pairs = tuple[Pixels, Pixels]

@@ -56,6 +56,12 @@ class Refinement:
     evidence: Evidence
     support: _Support | None = field(default=None, repr=False, compare=False)
 
+    def shift(self, camera: Camera, T_scene_cam: Array) -> float:
+        """Roughly how far the image would move to another pose, in image widths; of a pose."""
+        assert self.support is not None and self.T_scene_cam is not None
+        depth = self.support.view.median_depth
+        return _motion_px(camera, self.T_scene_cam, T_scene_cam, depth) / camera.width
+
 
 @dataclass(frozen=True)
 class _View:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from igaussian_core.coarse.attention import PoseNetwork, Prediction, SourceViews
 from igaussian_core.errors import ConfigError
-from igaussian_core.torch_threads import one_torch_thread
+from igaussian_core.torch_cpu import has_native_bfloat16, one_torch_thread
 from igaussian_core.training.augment import augmented, composite
 from igaussian_core.training.bank import Bank, Views
 
@@ -285,8 +285,7 @@ class Trainer:
         rays = torch.stack([m.rays for m in maps])
         weight_t = torch.tensor([m.lambda_t for m in maps]).repeat_interleave(len(batches[0].rgba))
         network.zero_grad(set_to_none=True)
-        # the cache of weights is the process's: another thread would empty it halfway
-        with torch.autocast("cpu", torch.bfloat16, cache_enabled=False):
+        with _mixed_precision():
             prediction = network(images, rays, views)
         loss = pose_loss(prediction, truth, views, weight_t, self.options, random)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -336,6 +335,14 @@ class Trainer:
         self.curve = Curve(**state["curve"])
 
 
+def _mixed_precision(enabled: bool = True) -> torch.autocast:
+    """bfloat16 where the CPU computes in it. Without autocast's cache of weights, which is the
+    process's: another thread would empty it halfway."""
+    return torch.autocast(
+        "cpu", torch.bfloat16, enabled=enabled and has_native_bfloat16(), cache_enabled=False
+    )
+
+
 def _sharing_copy(network: PoseNetwork) -> PoseNetwork:
     """The same parameters; gradients and statistics of its own."""
     other = copy.deepcopy(network)
@@ -350,7 +357,7 @@ def source_views(network: PoseNetwork, training_map: TrainingMap) -> SourceViews
     images = composite(views.rgba, training_map.background[None]).permute(0, 3, 1, 2)
     images = images.contiguous(memory_format=torch.channels_last)
     network.eval()
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=training):
+    with torch.no_grad(), _mixed_precision(training):
         features = network.backbone(images).float()
     network.train(training)
     return SourceViews(
@@ -372,7 +379,7 @@ def held_out_errors(
     for start in range(0, len(held_out.rgba), chunk):
         part = Views(*(field[start : start + chunk] for field in held_out))
         images = composite(part.rgba, training_map.background[None]).permute(0, 3, 1, 2)
-        with torch.autocast("cpu", torch.bfloat16, enabled=training):
+        with _mixed_precision(training):
             prediction = network(
                 images.contiguous(memory_format=torch.channels_last), training_map.rays[None],
                 sources,

@@ -24,7 +24,7 @@ CORE = Path(igaussian_core.__file__).parent
 LAYERS = [
     ["errors"],
     ["config", "geometry", "camera", "camera_info", "image_decode", "timing", "result",
-     "hypothesis", "frame", "resources", "worker", "contrast", "tum", "torch_threads"],
+     "hypothesis", "frame", "resources", "worker", "contrast", "tum", "torch_cpu"],
     ["render", "posed_images", "bag_storage", "bags", "formats", "colour",
      "pictures"],
     ["gaussian_map"],
