@@ -178,12 +178,14 @@ def mutual_matches(
     """Mutual nearest neighbours [M, 2] of descriptors [N, D] and [K, D] above a similarity."""
     if len(a) == 0 or len(b) == 0:
         return np.zeros((0, 2), np.int64)
-    similarity = torch.from_numpy(a) @ torch.from_numpy(b).T
-    value, best = similarity.max(1)
-    back = similarity.argmax(0)
-    keep = (back[best] == torch.arange(len(a))) & (value > min_similarity)
-    index = torch.nonzero(keep)[:, 0]
-    return np.asarray(torch.stack([index, best[index]], 1).numpy(), np.int64)
+    ours, theirs = torch.from_numpy(a), torch.from_numpy(b)
+    # a second product costs a tenth of a search along the first one's columns; torch's searches
+    # take ten times as long as numpy's
+    similarity, back = (ours @ theirs.T).numpy(), (theirs @ ours.T).numpy().argmax(1)
+    best = similarity.argmax(1)
+    numbers = np.arange(len(a))
+    keep = (back[best] == numbers) & (similarity[numbers, best] > min_similarity)
+    return np.stack([numbers[keep], best[keep]], 1).astype(np.int64)
 
 
 def _peaks(

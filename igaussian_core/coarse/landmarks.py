@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -15,6 +16,9 @@ from igaussian_core.features import Features, mutual_matches
 from igaussian_core.hypothesis import Hypothesis
 from igaussian_core.map_package import Landmarks
 from igaussian_core.pnp import solve_pnp
+
+_RANKED_TOGETHER = 8  # source views in one product, which then stays in the cache
+_MOST_MATCHES = 1500  # that one pose is solved from; more take time and make it no better
 
 
 class LandmarkLocalizer:
@@ -54,7 +58,7 @@ class LandmarkLocalizer:
 
     def _places(self, features: Features, camera: Camera) -> Iterator[Hypothesis]:
         views = self.rank_views(features)[: self._config.top_views]
-        query, points = self._matches(features, views)
+        query, points = _thinned(*self._matches(features, views))
         while len(query) >= self._config.min_inliers:
             uv = features.uv[query]
             solution = solve_pnp(camera, uv, points, self._config.max_reprojection_px)
@@ -71,10 +75,11 @@ class LandmarkLocalizer:
         query = torch.from_numpy(features.descriptors[: self._config.rank_keypoints])
         if len(query) == 0:
             return np.zeros(0, np.int64)
-        counts = [
-            _count_mutual(query, view, self._min_similarity) for view in self._rank_descriptors
-        ]
-        return np.argsort(-np.array(counts), kind="stable").astype(np.int64)
+        counts = np.concatenate([
+            _count_mutual(query, views, self._min_similarity)
+            for views in self._rank_descriptors.split(_RANKED_TOGETHER)
+        ])  # fmt: skip
+        return np.argsort(-counts, kind="stable").astype(np.int64)
 
     def _matches(
         self, features: Features, views: NDArray[np.int64]
@@ -91,18 +96,33 @@ class LandmarkLocalizer:
         return np.concatenate(query), np.concatenate(points)
 
 
-def _best_of_each_view(landmarks: Landmarks, count: int) -> list[torch.Tensor]:
-    return [
-        torch.from_numpy(landmarks.descriptors[start : min(start + count, stop)])
-        for start, stop in zip(landmarks.offsets[:-1], landmarks.offsets[1:], strict=True)
-    ]
+def _thinned(
+    query: NDArray[np.int64], points: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """At most so many matches as are of use, from all over the list."""
+    if len(query) <= _MOST_MATCHES:
+        return query, points
+    kept = np.linspace(0, len(query) - 1, _MOST_MATCHES).astype(np.int64)
+    return query[kept], points[kept]
 
 
-def _count_mutual(a: torch.Tensor, b: torch.Tensor, min_similarity: float) -> int:
-    """Number of mutual nearest neighbours above a similarity."""
-    if len(b) == 0:
-        return 0
-    similarity = a @ b.T
-    value, best = similarity.max(1)
-    back = similarity.argmax(0)
-    return int(((back[best] == torch.arange(len(a))) & (value > min_similarity)).sum())
+def _best_of_each_view(landmarks: Landmarks, count: int) -> torch.Tensor:
+    """Descriptors [V, count, D], zeros behind the landmarks of a view that has fewer."""
+    best = torch.zeros(landmarks.view_count, count, landmarks.descriptors.shape[1])
+    for view, (start, stop) in enumerate(pairwise(landmarks.offsets)):
+        found = landmarks.descriptors[start : min(start + count, stop)]
+        best[view, : len(found)] = torch.from_numpy(found)
+    return best
+
+
+def _count_mutual(
+    query: torch.Tensor, views: torch.Tensor, min_similarity: float
+) -> NDArray[np.int64]:
+    """Numbers [V] of mutual nearest neighbours of [N, D] and [V, K, D] above a similarity."""
+    all_views = views.flatten(0, 1)
+    similarity = (query @ all_views.T).numpy().reshape(len(query), *views.shape[:2])
+    back = (all_views @ query.T).numpy().argmax(1).reshape(views.shape[:2])
+    best = similarity.argmax(2)
+    value = np.take_along_axis(similarity, best[..., None], 2)[..., 0]
+    mutual = back[np.arange(len(views)), best] == np.arange(len(query))[:, None]
+    return (mutual & (value > min_similarity)).sum(0)
