@@ -132,7 +132,7 @@ inline void from_lines(const float* lines, const int (&fields)[kCount], F* rows)
 #if defined(__AVX2__)
 constexpr int W = 8;
 constexpr bool kHalfSh = true;
-constexpr int kAbreast = 2, kTogether = 8;
+constexpr int kAbreast = 4, kTogether = 8;
 using F = __m256;
 using I32 = int32_t __attribute__((vector_size(32)));
 
