@@ -29,7 +29,7 @@ from igaussian_core.cli_tools import (
     progress_bars,
 )
 from igaussian_core.cli_train import network_summary, train_app, train_map
-from igaussian_core.errors import ConfigError, IGaussianError
+from igaussian_core.errors import ConfigError, IGaussianError, MapError
 
 app = typer.Typer(help=__doc__, no_args_is_help=True, pretty_exceptions_enable=False)
 map_app = typer.Typer(help="Compile, inspect and align maps.", no_args_is_help=True)
@@ -79,8 +79,11 @@ def map_compile(
     ] = None,
     up: Annotated[str | None, typer.Option(help="up direction in the scene: x,y,z")] = None,
     views: Annotated[int, typer.Option(help="most source views", min=1, max=2000)] = 120,
+    network: Annotated[
+        bool, typer.Option(help="a pose network of the shipped weights: half a minute")
+    ] = True,
     train: Annotated[
-        bool, typer.Option(help="train the pose network on the map, too: some ten minutes")
+        bool, typer.Option(help="train it on the map: more exact, ten minutes and more")
     ] = False,
     train_steps: Annotated[
         int | None, typer.Option(help="of that training; fewer are quicker and less exact", min=0)
@@ -106,6 +109,23 @@ def map_compile(
     )
     if train:
         train_map(output, steps=train_steps, config=config, set_=set_)
+    elif network:
+        _add_network(output, load_config(config, set_).runtime.threads)
+
+
+def _add_network(path: Path, threads: int) -> None:
+    """An untrained pose network; a map that shows too little for one stays without."""
+    from igaussian_core.map_package import open_package, with_network
+    from igaussian_core.training.map_network import untrained_map_network
+
+    try:
+        with progress_bars() as progress:
+            found = untrained_map_network(open_package(path), threads, progress=Stages(progress))
+    except MapError as error:
+        console.print(f"{path}: no pose network, landmarks alone: {error}")
+        return
+    with_network(path, found.data())
+    console.print(f"{path}: pose network, untrained: {network_summary(found.report)}")
 
 
 @map_app.command("views")

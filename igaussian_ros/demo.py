@@ -28,7 +28,7 @@ from rich.text import Text
 from igaussian_core.bags import Bag
 from igaussian_core.compile_map import compile_map
 from igaussian_core.config import Config
-from igaussian_core.errors import IGaussianError
+from igaussian_core.errors import IGaussianError, MapError
 from igaussian_core.evaluate.drive import DriveFrame, MemorySample, Trajectory, summarize_drive
 from igaussian_core.evaluate.drive_overlays import make_overlays
 from igaussian_core.evaluate.drive_recording import write_recording
@@ -38,8 +38,9 @@ from igaussian_core.evaluate.metrics import plain
 from igaussian_core.features import make_matcher
 from igaussian_core.gaussian_map import file_sha256
 from igaussian_core.localizer import Localizer
-from igaussian_core.map_package import open_package
+from igaussian_core.map_package import open_package, with_network
 from igaussian_core.resources import resource
+from igaussian_core.training.map_network import untrained_map_network
 
 # what the bundled drive has to reach; a drive of one's own is only reported
 BUNDLED_LIMITS: Mapping[str, float] = {
@@ -180,7 +181,12 @@ def prepare_map(options: DemoOptions, console: Console) -> Path:
                 tasks[stage] = progress.add_task(stage, total=of)
             progress.update(tasks[stage], completed=done, total=of)
 
-        compile_map(source, target, cameras, None, options.config, show)
+        package = compile_map(source, target, cameras, None, options.config, show)
+        try:
+            network = untrained_map_network(package, options.config.runtime.threads, progress=show)
+            with_network(target, network.data())
+        except MapError as error:
+            console.print(f"no pose network, landmarks alone: {error}")
     console.print(f"map {target}: compiled in {time.monotonic() - begin:.0f} s")
     return target
 

@@ -25,6 +25,7 @@ _MIN_COVERED = 0.6  # share of a scene's view that the map must cover
 _MIN_CONTRAST = 6.0  # grey levels: a bare ceiling tells nobody where he is
 _CHUNK = 64
 _TRIES = 60  # chunks without a usable view before a map is given up
+_WORST_YIELD = 0.02  # share of usable views below which it is given up as well
 
 
 class Views(NamedTuple):
@@ -106,15 +107,19 @@ def draw_views(
         MapError: the map shows next to nothing from where the sampler draws.
     """
     found: list[Views] = []
-    total = failed = 0
+    total = failed = drawn = 0
     while total < count:
         views, usable = renderer.render(sampler.draw(rng, _CHUNK))
         index = np.flatnonzero(usable)[: count - total]
+        drawn += _CHUNK
         failed = 0 if len(index) else failed + 1
-        if failed > _TRIES:
-            raise MapError("training: the map shows nothing from where views are drawn")
         found.append(views.at(index))
         total += len(index)
+        if failed > _TRIES or (drawn > _TRIES * _CHUNK and total < _WORST_YIELD * drawn):
+            raise MapError(
+                f"training: the map shows too little from where views are drawn: {total} of "
+                f"{drawn} views are of use"
+            )
         progress(total, count)
     return Views(*(torch.cat(parts) for parts in zip(*found, strict=True)))
 

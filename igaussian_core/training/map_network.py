@@ -15,7 +15,7 @@ from igaussian_core.camera import Camera
 from igaussian_core.coarse.attention import PoseNetwork
 from igaussian_core.coarse.canonical import canonical_camera, cell_rays
 from igaussian_core.coarse.memory import ViewMemory, fit_memory, raw_keys, recall
-from igaussian_core.coarse.network import MapNetwork
+from igaussian_core.coarse.network import MapNetwork, load_checkpoint, shipped_checkpoint
 from igaussian_core.coarse.pose_scale import PoseScale
 from igaussian_core.map_package import MapPackage
 from igaussian_core.sphere import Sphere, sphere_of
@@ -41,6 +41,8 @@ OPTIONS = TrainOptions(steps=2000)
 BANK = 6000
 MEMORY = 12000
 HELD_OUT = 256
+UNTRAINED_MEMORY = 2000  # a sixth of the time, half as far off again
+UNTRAINED_HELD_OUT = 64
 _MIN_COVERED = 0.6  # of a scene's view; an object may fill little of one
 _NEAR_KNOWN = {"object": 0.3, "scene": 0.55}
 _CHUNK = 64
@@ -150,6 +152,27 @@ def train_map_network(
     count = MEMORY if memory is None else memory
     views = remember(trainer.network, data, setting, count, options.seed, progress)
     return trained_network(trainer.network, data, setting, options, views), curve
+
+
+def untrained_map_network(
+    package: MapPackage, threads: int = 2, seed: int = 0,
+    progress: Progress = lambda stage, done, of: None,
+) -> MapNetwork:  # fmt: skip
+    """The shipped joint weights with a memory of the map's views: seconds, and no training.
+
+    Raises:
+        MapError: the map shows next to nothing from where views are drawn.
+    """
+    torch.set_num_threads(threads)
+    network = load_checkpoint(shipped_checkpoint()).eval()
+    setting = setting_of(package, threads=threads)
+    count = UNTRAINED_MEMORY
+    data = training_map(
+        package.manifest.name, setting, count, seed, progress, UNTRAINED_HELD_OUT
+    )
+    views = remember(network, data, setting, count, seed, progress)
+    options = TrainOptions(steps=0, seed=seed)
+    return trained_network(network, data, setting, options, views)
 
 
 @torch.no_grad()

@@ -121,9 +121,11 @@ def test_compile_and_info(igaussian: Command, room_ply: Path, tmp_path: Path) ->
     ran = igaussian(
         "map", "compile", room_ply, "-o", target, "--cameras", room_ply.with_name("poses.json"),
         "--views", 6, "--kind", "scene", "--radius", 0.25, "--set", "features.keypoints=256",
+        "--no-network",
     )  # fmt: skip
     assert ran.code == 0
     assert "landmarks" in ran.out and "source views" in ran.out
+    assert open_package(target).network is None
     package = open_package(target)
     assert package.manifest.kind == "scene" and package.manifest.radius == 0.25
     assert 6 <= package.landmarks.view_count <= 6 + 16
