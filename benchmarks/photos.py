@@ -24,6 +24,7 @@ from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.evaluate.runner import run
 from igaussian_core.localizer import Localizer
 from igaussian_core.posed_images import PosedImage, read_posed_images
+from igaussian_core.training.map_network import add_untrained_network
 
 # name, set, training cameras given, kind, queries whose name starts so
 CASES = (
@@ -127,6 +128,7 @@ def compiled(
     if not target.is_dir():
         cameras = folder / "poses.json" if with_cameras else None
         compile_map(folder / "map.ply", target, cameras, CompileOptions(kind=kind))
+        add_untrained_network(target)
     return target
 
 

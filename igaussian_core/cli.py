@@ -115,17 +115,15 @@ def map_compile(
 
 def _add_network(path: Path, threads: int) -> None:
     """An untrained pose network; a map that shows too little for one stays without."""
-    from igaussian_core.map_package import open_package, with_network
-    from igaussian_core.training.map_network import untrained_map_network
+    from igaussian_core.training.map_network import add_untrained_network
 
     try:
         with progress_bars() as progress:
-            found = untrained_map_network(open_package(path), threads, progress=Stages(progress))
+            report = add_untrained_network(path, threads, Stages(progress))
     except MapError as error:
         console.print(f"{path}: no pose network, landmarks alone: {error}")
         return
-    with_network(path, found.data())
-    console.print(f"{path}: pose network, untrained: {network_summary(found.report)}")
+    console.print(f"{path}: pose network, untrained: {network_summary(report)}")
 
 
 @map_app.command("views")

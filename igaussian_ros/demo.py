@@ -38,9 +38,9 @@ from igaussian_core.evaluate.metrics import plain
 from igaussian_core.features import make_matcher
 from igaussian_core.gaussian_map import file_sha256
 from igaussian_core.localizer import Localizer
-from igaussian_core.map_package import open_package, with_network
+from igaussian_core.map_package import open_package
 from igaussian_core.resources import resource
-from igaussian_core.training.map_network import untrained_map_network
+from igaussian_core.training.map_network import add_untrained_network
 
 # what the bundled drive has to reach; a drive of one's own is only reported
 BUNDLED_LIMITS: Mapping[str, float] = {
@@ -181,10 +181,9 @@ def prepare_map(options: DemoOptions, console: Console) -> Path:
                 tasks[stage] = progress.add_task(stage, total=of)
             progress.update(tasks[stage], completed=done, total=of)
 
-        package = compile_map(source, target, cameras, None, options.config, show)
+        compile_map(source, target, cameras, None, options.config, show)
         try:
-            network = untrained_map_network(package, options.config.runtime.threads, progress=show)
-            with_network(target, network.data())
+            add_untrained_network(target, options.config.runtime.threads, show)
         except MapError as error:
             console.print(f"no pose network, landmarks alone: {error}")
     console.print(f"map {target}: compiled in {time.monotonic() - begin:.0f} s")

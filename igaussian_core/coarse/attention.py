@@ -175,7 +175,7 @@ class PoseNetwork(nn.Module):
                 float(log_weights.shape[1])))))  # fmt: skip
         weights = log_weights.exp()[..., None]
         return Prediction(
-            rotation=_orthonormal((weights[..., None] * rotations).sum(1)[..., :2]),
+            rotation=orthonormal((weights[..., None] * rotations).sum(1)[..., :2]),
             position=(weights * positions).sum(1),
             candidate_rotations=rotations,
             candidate_positions=positions,
@@ -252,7 +252,7 @@ class PoseNetwork(nn.Module):
         numbers = self.decode(hidden).float()
         base = numbers.new_tensor([1.0, 0, 0, 0, 1, 0])
         columns = numbers[..., :6] + base
-        rotation = _orthonormal(columns.unflatten(-1, (2, 3)).transpose(-1, -2))
+        rotation = orthonormal(columns.unflatten(-1, (2, 3)).transpose(-1, -2))
         position = numbers[..., 6:]
         if not self.config.relative:
             return rotation, position
@@ -289,7 +289,7 @@ def _flat(features: Tensor) -> Tensor:
     return features.permute(0, 2, 3, 1).flatten(1, 2)
 
 
-def _orthonormal(columns: Tensor) -> Tensor:
+def orthonormal(columns: Tensor) -> Tensor:
     """Rotations [..., 3, 3] whose first two columns come from [..., 3, 2] by Gram and Schmidt
     (the continuous representation of Zhou et al. 2019)."""
     x = F.normalize(columns[..., 0], dim=-1)

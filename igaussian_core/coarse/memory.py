@@ -65,7 +65,7 @@ class ViewMemory(NamedTuple):
     def similarity(self, features: Tensor) -> Tensor:
         """Kernel values [B, N] in [0, 1] of the backbone's features [B, C, h, w]."""
         queries = (raw_keys(features) - self.centre) @ self.basis
-        return _kernel(torch.cdist(queries, self.keys.float()), self.width)
+        return matern(torch.cdist(queries, self.keys.float()), self.width)
 
     def regressed(self, similarity: Tensor) -> tuple[Array, Array]:
         """Rotations [B, 3, 3] and positions [B, 3], normalised units, of kernel values [B, N]."""
@@ -158,7 +158,7 @@ def fit_memory(
 def _solved(keys: Tensor, width: Tensor, values: Tensor) -> Tensor:
     ridge = _RIDGE
     while ridge <= _LARGEST_RIDGE:
-        gram = _kernel(torch.cdist(keys, keys), width)
+        gram = matern(torch.cdist(keys, keys), width)
         gram.diagonal().add_(ridge)
         factor, failed = torch.linalg.cholesky_ex(gram)
         del gram
@@ -168,8 +168,11 @@ def _solved(keys: Tensor, width: Tensor, values: Tensor) -> Tensor:
     raise MapError("pose network: the map's views cannot be told apart")
 
 
-def _kernel(distance: Tensor, width: Tensor) -> Tensor:
-    """Matern 3/2 in place."""
+def matern(distance: Tensor, width: Tensor) -> Tensor:
+    """The kernel of order 3/2; overwrites the distances where no gradient flows through them."""
+    if distance.requires_grad:
+        scaled = distance * (3**0.5 / width)
+        return torch.exp(-scaled) * (1 + scaled)
     scaled = distance.mul_(3**0.5 / width)
     return torch.exp(-scaled).mul_(scaled.add_(1))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from igaussian_core.coarse.canonical import canonical_camera, cell_rays
 from igaussian_core.coarse.memory import ViewMemory, fit_memory, raw_keys, recall
 from igaussian_core.coarse.network import MapNetwork, load_checkpoint, shipped_checkpoint
 from igaussian_core.coarse.pose_scale import PoseScale
-from igaussian_core.map_package import MapPackage
+from igaussian_core.map_package import MapPackage, open_package, with_network
 from igaussian_core.sphere import Sphere, sphere_of
 from igaussian_core.training.augment import augmented, composite
 from igaussian_core.training.bank import Bank, ViewRenderer, draw_views
@@ -154,25 +154,29 @@ def train_map_network(
     return trained_network(trainer.network, data, setting, options, views), curve
 
 
-def untrained_map_network(
-    package: MapPackage, threads: int = 2, seed: int = 0,
-    progress: Progress = lambda stage, done, of: None,
-) -> MapNetwork:  # fmt: skip
-    """The shipped joint weights with a memory of the map's views: seconds, and no training.
+def add_untrained_network(
+    path: Path, threads: int = 2, progress: Progress = lambda stage, done, of: None
+) -> dict[str, Any]:
+    """Give a compiled map the shipped joint weights and a memory of its views: half a minute.
+
+    Returns:
+        What they reach on views held out.
 
     Raises:
-        MapError: the map shows next to nothing from where views are drawn.
+        MapError: no compiled map, or one that shows next to nothing from where views are drawn;
+            it stays as it was.
     """
     torch.set_num_threads(threads)
+    package, count, seed = open_package(path), UNTRAINED_MEMORY, 0
     network = load_checkpoint(shipped_checkpoint()).eval()
     setting = setting_of(package, threads=threads)
-    count = UNTRAINED_MEMORY
     data = training_map(
         package.manifest.name, setting, count, seed, progress, UNTRAINED_HELD_OUT
     )
     views = remember(network, data, setting, count, seed, progress)
-    options = TrainOptions(steps=0, seed=seed)
-    return trained_network(network, data, setting, options, views)
+    found = trained_network(network, data, setting, TrainOptions(steps=0, seed=seed), views)
+    with_network(path, found.data())
+    return found.report
 
 
 @torch.no_grad()

@@ -14,11 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from igaussian_core.coarse.attention import PoseNetwork, Prediction, SourceViews
+from igaussian_core.coarse.attention import PoseNetwork, Prediction, SourceViews, orthonormal
+from igaussian_core.coarse.memory import raw_keys
 from igaussian_core.errors import ConfigError
 from igaussian_core.torch_cpu import has_native_bfloat16, one_torch_thread
 from igaussian_core.training.augment import augmented, composite
 from igaussian_core.training.bank import Bank, Views
+from igaussian_core.training.recent_views import RecentViews
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
@@ -43,6 +45,7 @@ class TrainOptions:
         points: weight of the error of the cells' scene coordinates (ours).
         candidates: weight of the candidates' own errors, each times its weight (ours).
         resemblance: weight of the cells' comparison with the source views' (ours).
+        recall: weight of the error of a memory of the latest views (ours); of one map only.
         seed: of everything random.
         validate_every: steps.
         sources_every: steps after which the source views' features are computed anew.
@@ -56,6 +59,7 @@ class TrainOptions:
     points: float = 1.0
     candidates: float = 1.0
     resemblance: float = 20.0
+    recall: float = 1.0
     seed: int = 0
     validate_every: int = 250
     sources_every: int = 10
@@ -150,6 +154,13 @@ def pose_loss(
     return loss + options.resemblance * resembles
 
 
+def recall_loss(poses: Tensor, truth: Views, weight_t: Tensor) -> Tensor:
+    """lambda_r * degrees + lambda_t * distance of what `RecentViews` predicts, [B, 12]."""
+    rotation = orthonormal(poses[:, :9].unflatten(1, (3, 3))[..., :2])
+    loss = _LAMBDA_R * rotation_error_deg(rotation, truth.rotation)
+    return (loss + weight_t * _distance(poses[:, 9:], truth.position)).mean()
+
+
 def resemblance_loss(
     resemblance: Tensor, truth: Views, views: SourceViews, random: torch.Generator | None = None
 ) -> Tensor:
@@ -214,6 +225,8 @@ class Trainer:
             pct_start=0.15,
         )
         self._sources: dict[int, SourceViews] = {}
+        # keys of several maps cannot be compared
+        self._recent = RecentViews() if options.recall and len(maps) == 1 else None
         self._checkpoint = checkpoint
         if checkpoint is not None and checkpoint.is_file():
             self._resume(checkpoint)
@@ -259,9 +272,12 @@ class Trainer:
         sources = [self._source_views(i) for i in chosen]
         views = SourceViews(*(torch.cat(parts) for parts in zip(*sources, strict=True)))
         parts = [[b.at(np.arange(k, len(b.rgba), shares)) for b in batches] for k in range(shares)]
-        losses = list(workers.map(
+        results = list(workers.map(
             self._gradients, self._copies, self._randoms, parts, [maps] * shares, [views] * shares
         ))  # fmt: skip
+        if self._recent is not None:
+            for _, keys, truth in results:
+                self._recent.add(keys, truth)
         for ours, *theirs in zip(*(n.parameters() for n in self._copies), strict=True):
             for parameter in theirs:
                 if ours.grad is not None and parameter.grad is not None:
@@ -271,13 +287,14 @@ class Trainer:
         nn.utils.clip_grad_norm_(self.network.parameters(), _CLIP)
         self._optimizer.step()
         self._schedule.step()
-        return float(np.mean(losses))
+        return float(np.mean([loss for loss, *_ in results]))
 
     def _gradients(
         self, network: PoseNetwork, random: torch.Generator, batches: list[Views],
         maps: list[TrainingMap], views: SourceViews,
-    ) -> float:  # fmt: skip
-        """Leaves the gradients of a share of a step's images in `network`; its loss."""
+    ) -> tuple[float, Tensor, Views]:  # fmt: skip
+        """Leaves the gradients of a share of a step's images in `network`; its loss, and the
+        images' raw keys and truth."""
         images = torch.cat(
             [augmented(b.rgba, m.background, random) for b, m in zip(batches, maps, strict=True)]
         )
@@ -286,10 +303,15 @@ class Trainer:
         weight_t = torch.tensor([m.lambda_t for m in maps]).repeat_interleave(len(batches[0].rgba))
         network.zero_grad(set_to_none=True)
         with _mixed_precision():
-            prediction = network(images, rays, views)
+            features = network.backbone(images)
+            prediction = network.predict(features, rays, views)
         loss = pose_loss(prediction, truth, views, weight_t, self.options, random)
+        keys = raw_keys(features)
+        recalled = None if self._recent is None else self._recent.predict(keys)
+        if recalled is not None:
+            loss = loss + self.options.recall * recall_loss(recalled, truth, weight_t)
         loss.backward()  # type: ignore[no-untyped-call]
-        return float(loss.detach())
+        return float(loss.detach()), keys.detach(), truth
 
     def _source_views(self, index: int) -> SourceViews:
         """Features without gradients: the heads learn to compare, the backbone by the targets."""

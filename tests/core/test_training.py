@@ -35,7 +35,7 @@ from igaussian_core.query import Query
 from igaussian_core.sphere import Sphere
 from igaussian_core.timing import StageTimer
 from igaussian_core.training.augment import augmented, composite
-from igaussian_core.training.bank import Bank, draw_views
+from igaussian_core.training.bank import Bank, Views, draw_views
 from igaussian_core.training.curves import plot_curve, write_tensorboard
 from igaussian_core.training.map_network import (
     Setting,
@@ -49,9 +49,11 @@ from igaussian_core.training.pose_network import (
     Trainer,
     TrainOptions,
     held_out_errors,
+    recall_loss,
     rotation_error_deg,
 )
 from igaussian_core.training.poses import PoseSampler
+from igaussian_core.training.recent_views import RecentViews
 
 SMALL = NetworkConfig(width=64)
 
@@ -192,8 +194,32 @@ def test_training_lowers_the_error_on_views_it_has_not_seen(
     assert report["median_deg"] < 0.7 * before
     assert report["median_distance"] < 0.6 * setting.renderer.scale.length
     assert trainer.curve.steps == [30, 60]
-    assert trainer.curve.values["loss"][1] < trainer.curve.values["loss"][0]
+    assert trainer.curve.values["degrees"][1] < trainer.curve.values["degrees"][0]
     assert np.isfinite(trainer.curve.values["loss"]).all()
+
+
+def test_the_latest_views_tell_a_pose_that_keys_tell() -> None:
+    random = torch.Generator().manual_seed(0)
+    keys = torch.randn(700, 8, generator=random)
+    angles = 0.3 * keys[:, 0]
+    zero, one = torch.zeros_like(angles), torch.ones_like(angles)
+    turns = [angles.cos(), -angles.sin(), zero, angles.sin(), angles.cos(), zero, zero, zero, one]
+    nothing = torch.zeros(700, 1)
+    views = Views(
+        nothing, nothing, nothing, torch.stack(turns, 1).reshape(-1, 3, 3), 0.1 * keys[:, 1:4]
+    )
+    recent = RecentViews()
+    assert recent.predict(keys) is None
+    recent.add(keys[:600], Views(*(part[:600] for part in views)))
+    asked = keys[600:].clone().requires_grad_()
+    predicted = recent.predict(asked)
+    assert predicted is not None
+    truth = Views(*(part[600:] for part in views))
+    loss = recall_loss(predicted, truth, torch.full((100,), 30.0))
+    unknown = recall_loss(predicted.roll(1, 0), truth, torch.full((100,), 30.0))
+    assert loss < 0.5 * unknown
+    loss.backward()
+    assert asked.grad is not None and torch.isfinite(asked.grad).all() and asked.grad.any()
 
 
 def test_an_interrupted_training_goes_on(setting: Setting, tmp_path: Path) -> None:

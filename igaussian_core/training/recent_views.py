@@ -1,0 +1,60 @@
+"""What the memory (`coarse/memory.py`) would say of a training image, as a loss.
+
+The memory's regression among the views seen last stands for that among all views of the finished
+memory. Gradients flow through the image's own key only, as with the queues of momentum contrast
+(He et al. 2020).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from igaussian_core.coarse.memory import matern
+from igaussian_core.training.bank import Views
+
+_MOST = 2048  # views
+_LEAST = 512
+_REFIT_EVERY = 128  # views
+_RIDGE = 0.01
+_SAMPLE = 256
+
+
+class RecentViews:
+    """Keys and poses of the views that a network was trained on last, and a regression of them."""
+
+    def __init__(self) -> None:
+        self._keys, self._poses = torch.zeros(0, 0), torch.zeros(0, 12)
+        self._fit: tuple[Tensor, Tensor, Tensor, Tensor] | None = None
+        self._new = 0
+
+    @torch.no_grad()
+    def add(self, keys: Tensor, views: Views) -> None:
+        """Views that were trained on just now: raw keys [B, D] and poses."""
+        poses = torch.cat([views.rotation.flatten(1), views.position], 1)
+        self._keys = torch.cat([self._keys.reshape(-1, keys.shape[1]), keys.detach()])[-_MOST:]
+        self._poses = torch.cat([self._poses, poses])[-_MOST:]
+        self._new += len(keys)
+        if len(self._keys) >= _LEAST and self._new >= _REFIT_EVERY:
+            self._new = 0
+            self._refit()
+
+    def predict(self, keys: Tensor) -> Tensor | None:
+        """Poses [B, 12], rotation by rows and position, of raw keys; None before there are
+        enough views."""
+        if self._fit is None:
+            return None
+        known, width, mean, coefficients = self._fit
+        return matern(torch.cdist(keys, known), width) @ coefficients + mean
+
+    def _refit(self) -> None:
+        distance = torch.cdist(self._keys, self._keys)
+        width = distance[:_SAMPLE].median().clamp(min=1e-6)
+        gram = matern(distance, width)
+        gram.diagonal().add_(_RIDGE)
+        factor, failed = torch.linalg.cholesky_ex(gram)
+        if failed:
+            return
+        mean = self._poses.mean(0)
+        coefficients = torch.cholesky_solve(self._poses - mean, factor)
+        self._fit = (self._keys, width, mean, coefficients)
