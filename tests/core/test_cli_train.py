@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from igaussian_core.cli import app
-from igaussian_core.coarse.network import load_checkpoint
+from igaussian_core.coarse.network import MapNetwork, load_checkpoint
 from igaussian_core.errors import ConfigError, MapError
 from igaussian_core.map_package import open_package
 
@@ -27,7 +27,8 @@ def run(*arguments: object) -> str:
 
 @pytest.fixture(autouse=True)
 def few_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("igaussian_core.training.map_network.MEMORY", 96)
+    for name, few in (("MEMORY", 96), ("UNTRAINED_MEMORY", 160), ("UNTRAINED_HELD_OUT", 8)):
+        monkeypatch.setattr(f"igaussian_core.training.map_network.{name}", few)
 
 
 @pytest.fixture
@@ -62,6 +63,32 @@ def test_the_same_where_the_map_is_compiled(room_ply: Path, tmp_path: Path) -> N
     run("map", "compile", room_ply, "-o", target, "--cameras", room_ply.with_name("poses.json"),
         "--views", 12, "--train", "--train-steps", 1)  # fmt: skip
     assert open_package(target).network is not None
+
+
+def test_a_compiled_map_has_an_untrained_network(room_ply: Path, tmp_path: Path) -> None:
+    target = tmp_path / "fresh.igmap"
+    command = ("map", "compile", room_ply, "-o", target, "--cameras",
+               room_ply.with_name("poses.json"), "--views", 12)  # fmt: skip
+    assert "pose network, untrained: median error" in run(*command)
+    data = open_package(target).network
+    assert data is not None
+    trained = MapNetwork.from_data(data, "fresh")
+    assert trained.report["options"]["steps"] == 0 and trained.report["memory"] == 160
+    run(*command, "--no-network")
+    assert open_package(target).network is None
+
+
+def test_a_map_that_shows_too_little_is_compiled_without(
+    room_ply: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise MapError("the map shows too little")
+
+    monkeypatch.setattr("igaussian_core.training.map_network.training_map", fails)
+    output = run("map", "compile", room_ply, "-o", tmp_path / "room.igmap", "--cameras",
+                 room_ply.with_name("poses.json"), "--views", 12)  # fmt: skip
+    assert "no pose network, landmarks alone: the map shows too little" in output
+    assert open_package(tmp_path / "room.igmap").network is None
 
 
 def test_joint_training_writes_a_checkpoint(tmp_path: Path) -> None:
