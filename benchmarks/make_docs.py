@@ -32,6 +32,7 @@ SECTIONS: dict[str, Callable[[dict[str, Any]], str]] = {
     "stage_one": tables.stage_one,
     "scale": tables.scale,
     "render": render_tables.section,
+    "render_avx2": render_tables.section_of_another_machine,
 }
 _HEAD = """# Benchmarks
 
