@@ -309,104 +309,130 @@ struct alignas(64) Offsets {
 const Offsets kPixelOffsets = {{0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3},
                                {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3}};
 
-// W pixels while Gaussians are blended into them.
+// kVectors * W pixels of a cell, side by side, while Gaussians are blended into them: what they
+// share, a Gaussian's numbers and the part of its ellipse along x, is fetched and computed once.
 template <bool kExtra>
 struct Accumulator {
-  F x, y;      // pixel centres
-  M open;      // pixels that are not finished
-  F t, alpha;  // of open pixels the transmittance, of finished ones alpha
-  F red, green, blue, depth;
-  F median, heaviest, id;
+  F x, y[kVectors];  // pixel centres; x is the same in each vector
+  M open[kVectors];  // pixels that are not finished
+  F t[kVectors], alpha[kVectors];  // of open pixels the transmittance, of finished ones alpha
+  F red[kVectors], green[kVectors], blue[kVectors], depth[kVectors];
+  F median[kVectors], heaviest[kVectors], id[kVectors];
 
   inline void read(const float* p) {
-    t = load(p + kT * kPixels);
-    open = at_least(t, splat(kStop));
-    alpha = load(p + kAlpha * kPixels);
-    red = load(p + kRed * kPixels);
-    green = load(p + kGreen * kPixels);
-    blue = load(p + kBlue * kPixels);
-    depth = load(p + kDepth * kPixels);
-    if (!kExtra) return;
-    median = load(p + kMedian * kPixels);
-    heaviest = load(p + kWeight * kPixels);
-    id = load(p + kId * kPixels);
+    for (int v = 0; v < kVectors; ++v, p += W) {
+      t[v] = load(p + kT * kPixels);
+      open[v] = at_least(t[v], splat(kStop));
+      alpha[v] = load(p + kAlpha * kPixels);
+      red[v] = load(p + kRed * kPixels);
+      green[v] = load(p + kGreen * kPixels);
+      blue[v] = load(p + kBlue * kPixels);
+      depth[v] = load(p + kDepth * kPixels);
+      if (!kExtra) continue;
+      median[v] = load(p + kMedian * kPixels);
+      heaviest[v] = load(p + kWeight * kPixels);
+      id[v] = load(p + kId * kPixels);
+    }
   }
 
   inline void write(float* p) const {
-    store(p + kT * kPixels, t);
-    store(p + kAlpha * kPixels, pick(open, splat(1.0f) - t, alpha));
-    store(p + kRed * kPixels, red);
-    store(p + kGreen * kPixels, green);
-    store(p + kBlue * kPixels, blue);
-    store(p + kDepth * kPixels, depth);
-    if (!kExtra) return;
-    store(p + kMedian * kPixels, median);
-    store(p + kWeight * kPixels, heaviest);
-    store(p + kId * kPixels, id);
+    for (int v = 0; v < kVectors; ++v, p += W) {
+      store(p + kT * kPixels, t[v]);
+      store(p + kAlpha * kPixels, pick(open[v], splat(1.0f) - t[v], alpha[v]));
+      store(p + kRed * kPixels, red[v]);
+      store(p + kGreen * kPixels, green[v]);
+      store(p + kBlue * kPixels, blue[v]);
+      store(p + kDepth * kPixels, depth[v]);
+      if (!kExtra) continue;
+      store(p + kMedian * kPixels, median[v]);
+      store(p + kWeight * kPixels, heaviest[v]);
+      store(p + kId * kPixels, id[v]);
+    }
+  }
+
+  inline unsigned unfinished() const {
+    unsigned some = 0;
+    for (int v = 0; v < kVectors; ++v) some |= bits(open[v]);
+    return some;
   }
 
   // alphas of kAbreast Gaussians, step by step: each step waits for the one before
-  inline void alphas(const Splat* splats, const uint32_t* list, F* a) const {
+  inline void alphas(const Splat* splats, const uint32_t* list, F (*a)[kVectors]) const {
+    constexpr int kAll = kAbreast * kVectors;
     const Splat* s[kAbreast];
-    F dx[kAbreast], dy[kAbreast], p[kAbreast], q[kAbreast];
+    F along_x[kAbreast], dy[kAll], p[kAll], q[kAll], power[kAll];
     for (int i = 0; i < kAbreast; ++i) s[i] = splats + list[i];
-    for (int i = 0; i < kAbreast; ++i) dx[i] = x - splat(s[i]->u);
-    for (int i = 0; i < kAbreast; ++i) dy[i] = y - splat(s[i]->v);
-    for (int i = 0; i < kAbreast; ++i) q[i] = splat(s[i]->across) * dy[i];
-    for (int i = 0; i < kAbreast; ++i) p[i] = splat(s[i]->shear) * dy[i];
-    for (int i = 0; i < kAbreast; ++i) p[i] = splat(s[i]->along) * dx[i] + p[i];
-    for (int i = 0; i < kAbreast; ++i) a[i] = minus_product(splat(s[i]->reach), q[i], q[i]);
-    for (int i = 0; i < kAbreast; ++i) a[i] = minus_product(a[i], p[i], p[i]);
-    alphas_near<kAbreast>(a);
-    for (int i = 0; i < kAbreast; ++i) a[i] = smaller_positive(a[i], splat(kAlphaMax));
+    for (int i = 0; i < kAbreast; ++i) along_x[i] = splat(s[i]->along) * (x - splat(s[i]->u));
+    const auto each = [&](auto step) {
+      for (int i = 0; i < kAbreast; ++i) {
+        for (int v = 0; v < kVectors; ++v) step(i, v, i * kVectors + v);
+      }
+    };
+    each([&](int i, int v, int n) { dy[n] = y[v] - splat(s[i]->v); });
+    each([&](int i, int, int n) { q[n] = splat(s[i]->across) * dy[n]; });
+    each([&](int i, int, int n) { p[n] = splat(s[i]->shear) * dy[n] + along_x[i]; });
+    each([&](int i, int, int n) { power[n] = minus_product(splat(s[i]->reach), q[n], q[n]); });
+    each([&](int, int, int n) { power[n] = minus_product(power[n], p[n], p[n]); });
+    alphas_near<kAll>(power);
+    each([&](int i, int v, int n) { a[i][v] = smaller_positive(power[n], splat(kAlphaMax)); });
   }
 
   // kTogether Gaussians, front to back
   inline void add(const Splat* splats, const uint32_t* list) {
-    F a[kTogether], weight[kTogether], left[kTogether];
+    F a[kTogether][kVectors], weight[kTogether][kVectors], left[kTogether][kVectors];
+    F before[kVectors];
     for (int i = 0; i < kTogether; i += kAbreast) alphas(splats, list + i, a + i);
-    const F before = t;
+    for (int v = 0; v < kVectors; ++v) before[v] = t[v];
     for (int i = 0; i < kTogether; ++i) {
-      weight[i] = a[i] * t;
-      left[i] = t = minus_product(t, a[i], t);
+      for (int v = 0; v < kVectors; ++v) {
+        weight[i][v] = a[i][v] * t[v];
+        left[i][v] = t[v] = minus_product(t[v], a[i][v], t[v]);
+      }
     }
-    if (__builtin_expect(bits(without(open, at_least(t, splat(kStop)))), 0)) {
-      finish_some(before, a, weight, left);
+    unsigned finishing = 0;
+    for (int v = 0; v < kVectors; ++v) {
+      finishing |= bits(without(open[v], at_least(t[v], splat(kStop))));
     }
+    if (__builtin_expect(finishing, 0)) finish_some(before, a, weight, left);
     for (int i = 0; i < kTogether; ++i) {
       const Splat& s = splats[list[i]];
-      red = red + weight[i] * splat(s.red);
-      green = green + weight[i] * splat(s.green);
-      blue = blue + weight[i] * splat(s.blue);
-      depth = depth + weight[i] * splat(s.z);
-      if (kExtra) add_extra(s, weight[i], i ? left[i - 1] : before, left[i]);
+      for (int v = 0; v < kVectors; ++v) {
+        red[v] = red[v] + weight[i][v] * splat(s.red);
+        green[v] = green[v] + weight[i][v] * splat(s.green);
+        blue[v] = blue[v] + weight[i][v] * splat(s.blue);
+        depth[v] = depth[v] + weight[i][v] * splat(s.z);
+        if (kExtra) add_extra(s, v, weight[i][v], i ? left[i - 1][v] : before[v], left[i][v]);
+      }
     }
   }
 
   // Blends again where a pixel finishes: the Gaussian that would push its transmittance under
   // kStop is dropped, and so is all behind it.
-  inline void finish_some(F before, const F* a, F* weight, F* left) {
-    t = before;
-    M still = open;
-    for (int i = 0; i < kTogether; ++i) {
-      const F w = a[i] * t, next = minus_product(t, a[i], t);
-      still = both(still, at_least(next, splat(kStop)));
-      weight[i] = keep(still, w);
-      left[i] = t = pick(still, next, t);
+  inline void finish_some(const F* before, const F (*a)[kVectors], F (*weight)[kVectors],
+                          F (*left)[kVectors]) {
+    for (int v = 0; v < kVectors; ++v) {
+      t[v] = before[v];
+      M still = open[v];
+      for (int i = 0; i < kTogether; ++i) {
+        const F w = a[i][v] * t[v], next = minus_product(t[v], a[i][v], t[v]);
+        still = both(still, at_least(next, splat(kStop)));
+        weight[i][v] = keep(still, w);
+        left[i][v] = t[v] = pick(still, next, t[v]);
+      }
+      alpha[v] = pick(without(open[v], still), splat(1.0f) - t[v], alpha[v]);
+      t[v] = keep(still, t[v]);
+      open[v] = still;
     }
-    alpha = pick(without(open, still), splat(1.0f) - t, alpha);
-    t = keep(still, t);
-    open = still;
   }
 
-  inline void add_extra(const Splat& s, F weight, F before, F after) {
+  inline void add_extra(const Splat& s, int v, F weight, F before, F after) {
     const F half = splat(0.5f);
-    median = pick(both(above(before, half), at_least(half, after)), splat(s.z), median);
-    const M heavier = above(weight, heaviest);
-    heaviest = pick(heavier, weight, heaviest);
+    median[v] = pick(both(above(before, half), at_least(half, after)), splat(s.z), median[v]);
+    const M heavier = above(weight, heaviest[v]);
+    heaviest[v] = pick(heavier, weight, heaviest[v]);
     float index;
     std::memcpy(&index, &s.index, 4);
-    id = pick(heavier, splat(index), id);
+    id[v] = pick(heavier, splat(index), id[v]);
   }
 };
 
@@ -414,16 +440,18 @@ struct Accumulator {
 template <bool kExtra>
 inline bool blend_cell(const Batch& batch, int size, float cell_u, float cell_v, float* pixels) {
   unsigned unfinished = 0;
-  for (int l = 0; l < kPixels; l += W) {
+  for (int l = 0; l < kPixels; l += kVectors * W) {
     Accumulator<kExtra> sum;
     sum.x = splat(cell_u) + load(kPixelOffsets.x + l);
-    sum.y = splat(cell_v) + load(kPixelOffsets.y + l);
+    for (int v = 0; v < kVectors; ++v) {
+      sum.y[v] = splat(cell_v) + load(kPixelOffsets.y + l + v * W);
+    }
     sum.read(pixels + l);
-    for (int i = 0; i < size && bits(sum.open); i += kTogether) {
+    for (int i = 0; i < size && sum.unfinished(); i += kTogether) {
       sum.add(batch.splats, batch.list + i);
     }
     sum.write(pixels + l);
-    unfinished |= bits(sum.open);
+    unfinished |= sum.unfinished();
   }
   return unfinished != 0;
 }

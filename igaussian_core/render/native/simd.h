@@ -17,9 +17,9 @@ namespace {
 
 constexpr int W = 16;
 constexpr bool kHalfSh = true;
-// Gaussians whose alphas are computed side by side, and those blended between two looks at
-// whether the pixels are finished: what the registers hold
-constexpr int kAbreast = 4, kTogether = 8;
+// Gaussians whose alphas are computed side by side, those blended between two looks at whether
+// the pixels are finished, and vectors of a cell blended side by side: what was fastest
+constexpr int kAbreast = 4, kTogether = 8, kVectors = 1;
 using F = __m512;
 using M = __mmask16;
 
@@ -132,7 +132,7 @@ inline void from_lines(const float* lines, const int (&fields)[kCount], F* rows)
 #if defined(__AVX2__)
 constexpr int W = 8;
 constexpr bool kHalfSh = true;
-constexpr int kAbreast = 4, kTogether = 8;
+constexpr int kAbreast = 1, kTogether = 4, kVectors = 2;
 using F = __m256;
 using I32 = int32_t __attribute__((vector_size(32)));
 
@@ -150,7 +150,7 @@ inline F rough_root(F x) { return x * _mm256_rsqrt_ps(x); }  // relative error 4
 #else
 constexpr int W = 4;
 constexpr bool kHalfSh = false;
-constexpr int kAbreast = 2, kTogether = 8;
+constexpr int kAbreast = 1, kTogether = 4, kVectors = 4;
 using F = float __attribute__((vector_size(16)));
 using I32 = int32_t __attribute__((vector_size(16)));
 
