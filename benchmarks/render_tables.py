@@ -42,8 +42,7 @@ def section_of_another_machine(data: Row) -> str:
     parts = [
         "## Rendering without AVX-512",
         *_head(data, " --no-oracle"),
-        "The goals above are for AVX-512 and not judged here. Nothing else ran: two threads take "
-        "little more than half the time of one.",
+        "The goals above are for AVX-512 and not judged here.",
         _gradients(data["scenes"]),
     ]
     return "\n\n".join(parts)
