@@ -97,10 +97,9 @@ def map_compile(
     options = CompileOptions(
         kind=kind, radius=radius, up=direction(up, "--up"), views=views  # type: ignore[arg-type]
     )
+    settings = load_config(config, set_)
     with progress_bars() as progress:
-        package = compile_map(
-            source, output, cameras, options, load_config(config, set_), Stages(progress)
-        )
+        package = compile_map(source, output, cameras, options, settings, Stages(progress))
     landmarks = package.landmarks
     console.print(
         f"{output}: {package.manifest.kind}, {len(package.gaussians):,} Gaussians, "
@@ -110,7 +109,7 @@ def map_compile(
     if train:
         train_map(output, steps=train_steps, config=config, set_=set_)
     elif network:
-        _add_network(output, load_config(config, set_).runtime.threads)
+        _add_network(output, settings.runtime.threads)
 
 
 def _add_network(path: Path, threads: int) -> None:

@@ -148,22 +148,30 @@ def fit_memory(
     _, directions = torch.linalg.eigh(centred.T @ centred)
     basis = directions[:, -dimensions:].flip(1).float().contiguous()
     keys = ((raw - centre) @ basis).half()
-    width = _WIDTH * torch.cdist(keys[:_SAMPLE].float(), keys.float()).median().clamp(min=1e-6)
     poses = torch.cat([rotation.flatten(1), position], 1)
-    mean = poses.mean(0)
-    coefficients = _solved(keys.float(), width, poses - mean)
+    width, mean, coefficients = fit_regression(keys.float(), poses, _RIDGE)
     return ViewMemory(centre, basis, keys, width.reshape(1), poses, mean, coefficients)
 
 
-def _solved(keys: Tensor, width: Tensor, values: Tensor) -> Tensor:
-    ridge = _RIDGE
+def fit_regression(keys: Tensor, values: Tensor, ridge: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Kernel ridge regression of values [N, V] by keys [N, E].
+
+    Returns:
+        The kernel's width, the values' mean [V], and coefficients [N, V]: values at other keys are
+        matern(distances, width) @ coefficients + mean.
+
+    Raises:
+        MapError: keys that cannot be told apart, or are not finite.
+    """
+    width = _WIDTH * torch.cdist(keys[:_SAMPLE], keys).median().clamp(min=1e-6)
+    mean = values.mean(0)
     while ridge <= _LARGEST_RIDGE:
         gram = matern(torch.cdist(keys, keys), width)
         gram.diagonal().add_(ridge)
         factor, failed = torch.linalg.cholesky_ex(gram)
         del gram
         if not failed:
-            return torch.cholesky_solve(values, factor)
+            return width, mean, torch.cholesky_solve(values - mean, factor)
         ridge *= 10  # many views alike
     raise MapError("pose network: the map's views cannot be told apart")
 

@@ -245,10 +245,7 @@ class Refiner:
             uv = support.uv_image[support.inliers]
             grey = query.once("grey", lambda: cv2.cvtColor(query.image, cv2.COLOR_RGB2GRAY))
             render = np.asarray(cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY), np.uint8)
-            shift = float("nan")
-            if prior is not None:
-                shift_px = _motion_px(camera, T_scene_cam, prior, view.median_depth)
-                shift = shift_px / camera.width
+            shift = float("nan") if prior is None else found.shift(camera, prior)
             evidence = replace(
                 found.evidence,
                 agreement=agreement(grey, render, view.covered, uv),

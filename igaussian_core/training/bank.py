@@ -115,7 +115,8 @@ def draw_views(
         failed = 0 if len(index) else failed + 1
         found.append(views.at(index))
         total += len(index)
-        if failed > _TRIES or (drawn > _TRIES * _CHUNK and total < _WORST_YIELD * drawn):
+        too_few = drawn > _TRIES * _CHUNK and total < min(count, _WORST_YIELD * drawn)
+        if failed > _TRIES or too_few:
             raise MapError(
                 f"training: the map shows too little from where views are drawn: {total} of "
                 f"{drawn} views are of use"

@@ -293,8 +293,8 @@ class Trainer:
         self, network: PoseNetwork, random: torch.Generator, batches: list[Views],
         maps: list[TrainingMap], views: SourceViews,
     ) -> tuple[float, Tensor, Views]:  # fmt: skip
-        """Leaves the gradients of a share of a step's images in `network`; its loss, and the
-        images' raw keys and truth."""
+        """Leaves the gradients of a share of a step's images in `network`; its `pose_loss`, and
+        the images' raw keys and truth."""
         images = torch.cat(
             [augmented(b.rgba, m.background, random) for b, m in zip(batches, maps, strict=True)]
         )
@@ -306,12 +306,13 @@ class Trainer:
             features = network.backbone(images)
             prediction = network.predict(features, rays, views)
         loss = pose_loss(prediction, truth, views, weight_t, self.options, random)
+        said = float(loss.detach())  # the same sum from the first step to the last
         keys = raw_keys(features)
         recalled = None if self._recent is None else self._recent.predict(keys)
         if recalled is not None:
             loss = loss + self.options.recall * recall_loss(recalled, truth, weight_t)
         loss.backward()  # type: ignore[no-untyped-call]
-        return float(loss.detach()), keys.detach(), truth
+        return said, keys.detach(), truth
 
     def _source_views(self, index: int) -> SourceViews:
         """Features without gradients: the heads learn to compare, the backbone by the targets."""

@@ -10,14 +10,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from igaussian_core.coarse.memory import matern
+from igaussian_core.coarse.memory import fit_regression, matern
 from igaussian_core.training.bank import Views
 
 _MOST = 2048  # views
 _LEAST = 512
 _REFIT_EVERY = 128  # views
 _RIDGE = 0.01
-_SAMPLE = 256
 
 
 class RecentViews:
@@ -37,7 +36,7 @@ class RecentViews:
         self._new += len(keys)
         if len(self._keys) >= _LEAST and self._new >= _REFIT_EVERY:
             self._new = 0
-            self._refit()
+            self._fit = (self._keys, *fit_regression(self._keys, self._poses, _RIDGE))
 
     def predict(self, keys: Tensor) -> Tensor | None:
         """Poses [B, 12], rotation by rows and position, of raw keys; None before there are
@@ -46,15 +45,3 @@ class RecentViews:
             return None
         known, width, mean, coefficients = self._fit
         return matern(torch.cdist(keys, known), width) @ coefficients + mean
-
-    def _refit(self) -> None:
-        distance = torch.cdist(self._keys, self._keys)
-        width = distance[:_SAMPLE].median().clamp(min=1e-6)
-        gram = matern(distance, width)
-        gram.diagonal().add_(_RIDGE)
-        factor, failed = torch.linalg.cholesky_ex(gram)
-        if failed:
-            return
-        mean = self._poses.mean(0)
-        coefficients = torch.cholesky_solve(self._poses - mean, factor)
-        self._fit = (self._keys, width, mean, coefficients)

@@ -194,6 +194,7 @@ def test_training_lowers_the_error_on_views_it_has_not_seen(
     assert report["median_deg"] < 0.7 * before
     assert report["median_distance"] < 0.6 * setting.renderer.scale.length
     assert trainer.curve.steps == [30, 60]
+    assert trainer.curve.values["loss"][1] < trainer.curve.values["loss"][0]
     assert trainer.curve.values["degrees"][1] < trainer.curve.values["degrees"][0]
     assert np.isfinite(trainer.curve.values["loss"]).all()
 
