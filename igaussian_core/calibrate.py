@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 MIN_POSES = 12  # with fewer, one more photo changes the factor by half
 _DEFAULT_POSES = 2  # whose worth the default counts
 _DEGREES_OF_FREEDOM = 6
-_RANGE = (0.05, 100.0)
+_RANGE = (0.01, 1e4)
 _MAX_ERROR_DEG = 5.0  # beyond it a pose is wrong, which no covariance is meant to cover
 
 
@@ -109,7 +109,7 @@ def calibrate(
 
 
 def covariance_scale(nees: ArrayLike) -> float:
-    """The factor [0.05 to 100] that makes e^T C^-1 e [N] what six numbers' should be.
+    """The factor [0.01 to 10,000] that makes e^T C^-1 e [N] what six numbers' should be.
 
     That is a mean of 6, or, where the errors' tail is longer than a normal distribution's, 95 %
     inside the 95 % ellipsoid: the larger of both. The default, 1, counts as two more poses: few

@@ -140,19 +140,12 @@ class RefineConfig:
     )
     photometric_pixels: int = _option(6000, "most pixels that are polished with", 200, 100000)
     covariance_cell_px: float = _option(
-        32.0, "side of image cells whose matches count as one in the covariance, since "
-        "neighbours share the map's errors; 0: each counts", 0, 1000
+        32.0, "side of the image cells over which errors are summed for the covariance, "
+        "since neighbours share the map's errors; 0: each match by itself", 0, 1000
     )  # fmt: skip
     covariance_inflation: float = _option(
-        4.0, "variance factor, since sigma is measured on inliers and errors reach over cells",
-        1, 1000,
+        8.0, "variance factor, since the map's errors reach over cells", 1, 1000,
     )  # fmt: skip
-    position_floor_rel: float = _option(
-        0.0002, "standard deviation of the map's own errors, share of the median depth", 0, 0.1
-    )
-    rotation_floor_deg: float = _option(
-        0.012, "standard deviation of the map's own errors in degrees", 0, 5
-    )
 
 
 @dataclass(frozen=True)
@@ -173,7 +166,7 @@ class VerifyConfig:
         0.05, "least share of the image's area that the inliers' spread covers", 0, 1
     )
     max_sigma_deg: float = _option(
-        0.7, "largest standard deviation of the pose's rotation, in degrees", 0.01, 90
+        1.0, "largest standard deviation of the pose's rotation, in degrees", 0.01, 90
     )
     min_agreement: float = _option(
         0.81, "least mean correlation of image and render in cells around the inliers; -1: any",

@@ -14,6 +14,7 @@ from igaussian_core.geometry import compose, inverse, skew, transform_points
 Array = NDArray[np.float64]
 
 _MIN_POINTS = 4
+_LEAST_SIGMA_PX = 0.1
 
 
 @dataclass(frozen=True)
@@ -89,48 +90,74 @@ def pose_covariance(
     camera: Camera,
     T_scene_cam: Array,
     points_scene: Array,
-    residuals_px: Array,
+    uv: NDArray[np.float32],
     cell_px: float = 0.0,
 ) -> Array:
     """Covariance [6, 6] of a pose from its inliers, scene axes, order x y z rx ry rz.
 
-    sigma^2 (J^T J)^-1 of the reprojection errors, with respect to a shift of the camera's
-    position and a rotation vector in the scene's axes that turns the estimate; sigma is the
-    residuals' root mean square per coordinate, at least 0.1 px.
+    With respect to a shift of the camera's position and a rotation vector in the scene's axes that
+    turns the estimate. Neighbouring matches share the map's errors, and some places have larger
+    ones than others, so the errors are summed over cells of the image, and what these sums scatter
+    counts (the cluster-robust estimate of White 1980 and Liang and Zeger 1986):
+
+        H^-1 (sum over cells of g g^T) H^-1        H = sum of J^T J, g = sum of J^T r in a cell
+
+    Of few cells, which may agree by chance, that says little. So sigma^2 (J^T J)^-1 is added, cells
+    counting as one match each, with the weight of six numbers among that many cells; sigma is the
+    residuals' root mean square and at least 0.1 px, which keeps the sum positive definite.
 
     Args:
         points_scene: inlier points [N, 3], in front of the camera.
-        residuals_px: their reprojection errors [N].
-        cell_px: side of image cells whose points count as one, since neighbours share the
-            map's errors; 0: every point counts.
+        uv: the pixels [N, 2] where the image shows them.
+        cell_px: side of the cells; 0: every point is one of its own.
     """
     rotation, position = T_scene_cam[:3, :3], T_scene_cam[:3, 3]
     offsets = np.asarray(points_scene, np.float64) - position
     x, y, z = (offsets @ rotation).T
-    zero = np.zeros_like(z)
-    d_pixel = np.stack(
-        [camera.fx / z, zero, -camera.fx * x / z**2, zero, camera.fy / z, -camera.fy * y / z**2], -1
-    ).reshape(-1, 2, 3)
-    d_position = np.broadcast_to(-rotation.T, (len(z), 3, 3))
-    d_rotation = rotation.T @ skew(offsets)
-    J = d_pixel @ np.concatenate([d_position, d_rotation], axis=2)
-    if cell_px > 0:
-        uv = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
-        J = J * np.sqrt(_share_of_cell(uv, cell_px))[:, None, None]
-    J = J.reshape(-1, 6)
-    variance = max(float(np.mean(np.square(residuals_px))) / 2, 0.1**2)
+    projected = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+    residuals = uv - projected
     # units of the translation columns are scaled so that the inverse stays well conditioned
     scale = np.array([1 / np.median(z)] * 3 + [1.0] * 3)
-    information = (J / scale).T @ (J / scale) + 1e-9 * np.eye(6)
-    covariance = variance * np.linalg.inv(information) / np.outer(scale, scale)
+    J = _pixel_by_pose(camera, rotation, offsets) / scale
+    cell, counts = _cells(projected, cell_px)
+    pulls = np.zeros((len(counts), 6))
+    np.add.at(pulls, cell, np.einsum("nij,ni->nj", J, residuals))
+    # steps of the pose by which each cell's matches alone would move it
+    steps = pulls @ _inverse(np.einsum("nij,nik->jk", J, J))
+    fitted = len(counts) / max(len(counts) - 6, 1)  # six numbers were
+    robust = fitted * steps.T @ steps
+    variance = max(float(np.square(residuals).mean()), _LEAST_SIGMA_PX**2)
+    alike = variance * _inverse(np.einsum("nij,nik,n->jk", J, J, 1 / counts[cell]))
+    covariance = robust + min(6 / len(counts), 1.0) * alike
+    covariance /= np.outer(scale, scale)
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def _share_of_cell(uv: Array, cell_px: float) -> Array:
-    """One over the number of pixels [N, 2] that are in the same cell of a grid."""
-    cells = np.floor(uv / cell_px).astype(np.int64)
-    _, index, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    return np.asarray(1.0 / counts[index.ravel()])
+def _pixel_by_pose(camera: Camera, rotation: Array, offsets: Array) -> Array:
+    """Derivatives [N, 2, 6] of projected points [N, 3], given relative to the camera's position
+    in scene axes, by its position and rotation vector."""
+    x, y, z = (offsets @ rotation).T
+    zero = np.zeros_like(z)
+    by_point = np.stack(
+        [camera.fx / z, zero, -camera.fx * x / z**2, zero, camera.fy / z, -camera.fy * y / z**2], -1
+    ).reshape(-1, 2, 3)
+    by_position = np.broadcast_to(-rotation.T, (len(z), 3, 3))
+    by_rotation = rotation.T @ skew(offsets)
+    return np.asarray(by_point @ np.concatenate([by_position, by_rotation], axis=2))
+
+
+def _inverse(information: Array) -> Array:
+    """Of a matrix [6, 6] that may not determine all directions."""
+    return np.linalg.inv(information + 1e-11 * np.trace(information) * np.eye(6))
+
+
+def _cells(uv: Array, cell_px: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """For pixels [N, 2] the number of their cell in a grid, and for each cell how many it has."""
+    if cell_px <= 0:
+        return np.arange(len(uv)), np.ones(len(uv), np.int64)
+    corners = np.floor(uv / cell_px).astype(np.int64)
+    _, index, counts = np.unique(corners, axis=0, return_inverse=True, return_counts=True)
+    return index.ravel(), counts
 
 
 def _poselib_camera(camera: Camera) -> dict[str, object]:

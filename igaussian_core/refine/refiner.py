@@ -312,11 +312,10 @@ class Refiner:
         if solution is None:
             return Refinement(None, None, Evidence(method, looked_at, coverage=view.coverage))
         inliers, residuals = solution.inliers, solution.residuals_px[solution.inliers]
-        covariance = pose_covariance(
-            camera, solution.T_scene_cam, points[inliers], residuals, config.covariance_cell_px
-        )
-        depths = transform_points(inverse(solution.T_scene_cam), points[inliers])[:, 2]
-        covariance = self._calibrated(covariance, float(np.median(depths)))
+        covariance = config.covariance_inflation * pose_covariance(
+            camera, solution.T_scene_cam, points[inliers], uv_image[inliers],
+            config.covariance_cell_px,
+        )  # fmt: skip
         evidence = Evidence(
             method=method,
             matches=looked_at,
@@ -328,14 +327,6 @@ class Refiner:
         )
         support = _Support(view, T_scene_cam, uv_image, points, inliers)
         return Refinement(solution.T_scene_cam, covariance, evidence, support)
-
-    def _calibrated(self, covariance: Array, median_depth: float) -> Array:
-        """The covariance with what the matches' scatter cannot show: the map's own errors."""
-        config = self._config
-        position = config.position_floor_rel * median_depth
-        rotation = np.radians(config.rotation_floor_deg)
-        floor = np.diag([position**2] * 3 + [rotation**2] * 3)
-        return config.covariance_inflation * covariance + floor
 
     def _status(self, refinement: Refinement) -> Status:
         return judge(refinement.evidence, self._verify)[0]

@@ -22,7 +22,6 @@ from igaussian_core.geometry import compose
 from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import open_package, with_covariance_scale
 from igaussian_core.pnp import pose_covariance
-from igaussian_core.refine.refiner import Refiner
 
 
 def chi_squared(count: int, seed: int = 0) -> np.ndarray:
@@ -43,7 +42,7 @@ def test_calibrated_errors_lie_inside_as_often_as_they_should() -> None:
 def test_a_long_tail_asks_for_more_than_the_mean() -> None:
     nees = np.concatenate([np.full(90, 0.5), np.full(10, 40.0)])
     assert covariance_scale(nees) == pytest.approx(40 / 12.592, rel=0.02)
-    assert covariance_scale(np.zeros(9)) >= 0.05 and covariance_scale(np.full(9, 1e9)) <= 100
+    assert covariance_scale(np.zeros(9)) > 0.01 and covariance_scale(np.full(9, 1e9)) <= 1e4
 
 
 def test_few_poses_stay_near_the_default() -> None:
@@ -147,8 +146,9 @@ def test_a_map_of_before_is_not_calibrated(copy: Path) -> None:
         open_package(copy)
 
 
+@pytest.mark.parametrize("noisy", [True, False])
 @pytest.mark.parametrize("shape", ["many", "few", "line", "one place", "far"])
-def test_a_covariance_is_positive_definite_always(shape: str, localizer: Localizer) -> None:
+def test_a_covariance_is_positive_definite_always(shape: str, noisy: bool) -> None:
     """Also of points that do not determine a pose."""
     rng = np.random.default_rng(1)
     camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
@@ -161,11 +161,10 @@ def test_a_covariance_is_positive_definite_always(shape: str, localizer: Localiz
         points = np.tile([[0.0, 0.0, 3.0]], (20, 1))
     elif shape == "far":
         points *= 1e4
-    residuals = np.abs(rng.normal(0, 0.3, len(points)))
-    covariance = pose_covariance(camera, np.eye(4), points, residuals, 32.0)
-    refiner: Refiner = localizer._refiner
+    uv = points[:, :2] / points[:, 2:] * 500 + (319.5, 239.5)
+    uv += rng.normal(0, 0.3 if noisy else 0, uv.shape)
+    covariance = pose_covariance(camera, np.eye(4), points, uv, 32.0)
     depth = float(np.median(points[:, 2]))
-    whole = refiner._calibrated(covariance, depth)
     units = np.diag([1 / depth] * 3 + [1.0] * 3)  # so that rounding is judged in one unit
-    assert np.allclose(whole, whole.T)
-    assert np.linalg.eigvalsh(units @ whole @ units).min() > 0
+    assert np.allclose(covariance, covariance.T)
+    assert np.linalg.eigvalsh(units @ covariance @ units).min() > 0

@@ -119,7 +119,7 @@ def estimate_many(
         T, keep = solution.T_scene_cam, solution.inliers
         turn = vector_from_rotation(T[:3, :3] @ T_TRUE[:3, :3].T)
         errors.append(np.concatenate([T[:3, 3] - T_TRUE[:3, 3], turn]))
-        covariances.append(pose_covariance(CAMERA, T, points[keep], solution.residuals_px[keep]))
+        covariances.append(pose_covariance(CAMERA, T, points[keep], noisy[keep]))
     return np.array(errors), np.array(covariances), points
 
 
@@ -137,57 +137,78 @@ def test_covariance_is_that_of_repeated_estimates(noise_px: float) -> None:
     assert np.abs(whitened - np.diag(np.diag(whitened))).max() < 0.6
 
 
+def noisy_matches(count: int, noise_px: float) -> tuple[np.ndarray, np.ndarray]:
+    uv, points = matches(count)
+    return uv + noise_px * np.random.default_rng(1).normal(0, 1, uv.shape), points
+
+
 def test_covariance_scales_as_it_should() -> None:
-    _, points = matches(100)
-    residuals = np.full(100, 2.0)
-    one = pose_covariance(CAMERA, T_TRUE, points, residuals)
+    uv, points = noisy_matches(100, 2.0)
+    one = pose_covariance(CAMERA, T_TRUE, points, uv)
     assert np.allclose(one, one.T) and np.linalg.eigvalsh(one).min() > 0
-    assert np.allclose(pose_covariance(CAMERA, T_TRUE, points, 2 * residuals), 4 * one, rtol=1e-3)
+    twice, _ = noisy_matches(100, 4.0)
+    assert np.allclose(pose_covariance(CAMERA, T_TRUE, points, twice), 4 * one, rtol=1e-3)
     far = T_TRUE[:3, 3] + 10 * (points - T_TRUE[:3, 3])  # the same picture, ten times larger
     tenfold = np.diag([10.0] * 3 + [1.0] * 3)
-    assert np.allclose(
-        pose_covariance(CAMERA, T_TRUE, far, residuals), tenfold @ one @ tenfold, rtol=1e-3
-    )
+    assert np.allclose(pose_covariance(CAMERA, T_TRUE, far, uv), tenfold @ one @ tenfold, rtol=1e-3)
 
 
 def test_covariance_turns_with_the_scene() -> None:
-    _, points = matches(100)
-    residuals = np.full(100, 1.0)
+    uv, points = noisy_matches(100, 1.0)
     R = rotation_from_vector([0.3, 0.8, -0.4])
     T_new_scene = compose(R, [5, 6, 7])
     turned = pose_covariance(
-        CAMERA, T_new_scene @ T_TRUE, transform_points(T_new_scene, points), residuals
+        CAMERA, T_new_scene @ T_TRUE, transform_points(T_new_scene, points), uv
     )
     block = np.kron(np.eye(2), R)
-    expected = block @ pose_covariance(CAMERA, T_TRUE, points, residuals) @ block.T
+    expected = block @ pose_covariance(CAMERA, T_TRUE, points, uv) @ block.T
     assert np.allclose(turned, expected, rtol=1e-6, atol=1e-12)
+
+
+def test_covariance_knows_of_errors_that_neighbours_share() -> None:
+    """Monte Carlo: errors alike within cells, and larger in one half of the image."""
+    rng = np.random.default_rng(3)
+    uv, points = matches(400)
+    cells = np.floor(uv / 64).astype(int)
+    shared, alone = [], []
+    for _ in range(150):
+        by_cell = rng.normal(0, 0.5, (*(cells.max(0) + 1), 2))
+        by_cell[: len(by_cell) // 2] *= 3
+        noisy = uv + by_cell[cells[:, 0], cells[:, 1]] + rng.normal(0, 0.1, uv.shape)
+        solution = solve_pnp(CAMERA, noisy.astype(np.float32), points, 20, T_TRUE)
+        assert solution is not None
+        T = solution.T_scene_cam
+        turn = vector_from_rotation(T_TRUE[:3, :3] @ T[:3, :3].T)
+        error = np.concatenate([T_TRUE[:3, 3] - T[:3, 3], turn])
+        for cell_px, nees in ((64.0, shared), (0.0, alone)):
+            covariance = pose_covariance(CAMERA, T, points, noisy, cell_px)
+            nees.append(error @ np.linalg.solve(covariance, error))
+    assert 4 < np.mean(shared) < 12
+    assert np.mean(alone) > 2 * np.mean(shared)
 
 
 def test_covariance_never_claims_perfection() -> None:
     uv, points = matches(100)
-    covariance = pose_covariance(CAMERA, T_TRUE, points, np.zeros(100))
-    assert np.sqrt(np.diag(covariance)).min() > 1e-5
+    covariance = pose_covariance(CAMERA, T_TRUE, points, uv)
+    assert np.sqrt(np.diag(covariance)).min() > 1e-6
 
 
 def test_covariance_of_few_or_degenerate_points_is_large_but_finite() -> None:
-    _, points = matches(4)
+    uv, points = noisy_matches(4, 1.0)
     points[:] = points[0]
-    covariance = pose_covariance(CAMERA, T_TRUE, points, np.full(4, 1.0))
+    covariance = pose_covariance(CAMERA, T_TRUE, points, uv[:1] + np.zeros((4, 1)))
     assert np.isfinite(covariance).all()
     assert np.linalg.eigvalsh(covariance).max() > 1.0
 
 
-def test_points_of_a_cell_count_as_one() -> None:
-    uv, points = matches(40)
-    residuals = np.full(len(points), 1.0)
-    one = pose_covariance(CAMERA, T_TRUE, points, residuals, cell_px=1.0)
-    assert np.allclose(one, pose_covariance(CAMERA, T_TRUE, points, residuals), rtol=1e-6)
-    # ninety-nine copies of a point say no more than that point
+def test_a_crowd_of_points_makes_no_pose_certain() -> None:
+    uv, points = noisy_matches(40, 1.0)
+    one = pose_covariance(CAMERA, T_TRUE, points, uv, cell_px=1.0)
+    assert np.allclose(one, pose_covariance(CAMERA, T_TRUE, points, uv), rtol=1e-6)
+    # a point a hundred times over pulls the pose as hard as its own error is large
     crowd = np.concatenate([points, np.repeat(points[:1], 99, axis=0)])
-    crowded = pose_covariance(CAMERA, T_TRUE, crowd, np.full(len(crowd), 1.0), cell_px=1.0)
-    assert np.allclose(crowded, one, rtol=1e-6)
-    # neighbours share a cell: less is known than by counting each
-    coarse = pose_covariance(CAMERA, T_TRUE, points, residuals, cell_px=160.0)
-    assert np.linalg.eigvalsh(coarse - one).min() > -1e-12
-    assert np.trace(coarse) > 1.5 * np.trace(one)
-    assert np.linalg.eigvalsh(coarse).min() > 0
+    crowd_uv = np.concatenate([uv, np.repeat(uv[:1], 99, axis=0)])
+    crowded = pose_covariance(CAMERA, T_TRUE, crowd, crowd_uv, cell_px=1.0)
+    by_itself = pose_covariance(CAMERA, T_TRUE, crowd, crowd_uv)
+    assert np.trace(crowded) > 0.8 * np.trace(one)
+    assert np.trace(crowded) > 1.2 * np.trace(by_itself)
