@@ -72,7 +72,7 @@ def train_map(
 @train_app.command("joint")
 def train_joint(
     output: Annotated[Path, typer.Option("-o", "--output", help="checkpoint (.safetensors)")],
-    maps: Annotated[int, typer.Option(help="procedural rooms and objects", min=1)] = 150,
+    maps: Annotated[int, typer.Option(help="procedural rooms and objects", min=1)] = 140,
     steps: StepsOption = None,
     seed: SeedOption = 0,
     curves: CurvesOption = None,
@@ -87,7 +87,7 @@ def train_joint(
     options = _options(OPTIONS, steps, seed)
     with progress_bars() as progress:
         network, curve = train_jointly(
-            maps, seed, options, _config(attention), threads,
+            maps, options, _config(attention), threads,
             output.with_name(output.name + ".training"), Stages(progress),
         )  # fmt: skip
     last = {name: values[-1] for name, values in curve.values.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from igaussian_core.training.pose_network import Curve
+from igaussian_core.training.trainer import Curve
 
 _TITLES = {
     "loss": "loss", "degrees": "rotation error on held-out views, median degrees",

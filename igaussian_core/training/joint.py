@@ -1,5 +1,5 @@
-"""Joint training over many procedural maps: the weights that every map's own training starts
-from, and that the project ships."""
+"""Joint training over many procedural maps: the weights that every compiled map starts with, and
+that the project ships."""
 
 from __future__ import annotations
 
@@ -15,28 +15,31 @@ from igaussian_core.coarse.attention import NetworkConfig, PoseNetwork
 from igaussian_core.coarse.pose_scale import PoseScale
 from igaussian_core.procedural import ProceduralMap, make_object, make_room
 from igaussian_core.sphere import Sphere
-from igaussian_core.training.bank import ViewRenderer
-from igaussian_core.training.map_network import Setting, object_sources, training_map
-from igaussian_core.training.pose_network import Curve, Trainer, TrainingMap, TrainOptions
+from igaussian_core.training.bank import ViewRenderer, draw_views
+from igaussian_core.training.episodes import (
+    EpisodeMap,
+    EpisodeOptions,
+    EpisodeTrainer,
+    episode_map,
+)
+from igaussian_core.training.pose_network import lambda_t
 from igaussian_core.training.poses import PoseSampler
-from igaussian_core.views import look_at, spread_indices
+from igaussian_core.training.trainer import Curve
+from igaussian_core.views import look_at
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
-OPTIONS = TrainOptions(
-    steps=3000, batch=32, maps_per_batch=2, learning_rate=1.5e-3, refresh=0, validate_every=200
-)
+OPTIONS = EpisodeOptions()
 _SIDE = 128
-_SOURCES = 16
-_VIEWS = 128  # of each map
-_HELD_OUT = 24
+_FIELD_DEG = {"object": (35, 50), "scene": (50, 75)}
+_VIEWS = 384  # of each map
+_ONE_HELD_OUT_OF = 25  # maps
 
 
 def train_jointly(
-    maps: int = 150,
-    first_seed: int = 0,
-    options: TrainOptions = OPTIONS,
+    maps: int = 140,
+    options: EpisodeOptions = OPTIONS,
     config: NetworkConfig | None = None,
     threads: int = 2,
     checkpoint: Path | None = None,
@@ -44,51 +47,60 @@ def train_jointly(
 ) -> tuple[PoseNetwork, Curve]:
     """A network trained on `maps` procedural rooms and objects alike.
 
+    Some more are made for the curve. A map's views take 25 MB of memory.
+
     Args:
-        first_seed: of the maps; others than those of a test.
+        options: its seed is that of the first map too.
     """
     torch.manual_seed(options.seed)
     torch.set_num_threads(threads)
-    data = []
-    for index in range(maps):
-        data.append(procedural_training_map(first_seed + index, threads))
-        progress("maps", index + 1, maps)
-    trainer = Trainer(PoseNetwork(config or NetworkConfig()), data, options, checkpoint, threads)
+    data, count = [], maps + 1 + maps // _ONE_HELD_OUT_OF
+    for index in range(count):
+        data.append(procedural_views(options.seed + index, threads))
+        progress("maps", index + 1, count)
+    trainer = EpisodeTrainer(
+        PoseNetwork(config or NetworkConfig()), data[:maps], data[maps:], options, checkpoint,
+        threads,
+    )  # fmt: skip
     return trainer.network, trainer.run(progress)
 
 
-def procedural_training_map(seed: int, threads: int = 2) -> TrainingMap:
+def procedural_views(seed: int, threads: int = 2, count: int = _VIEWS) -> EpisodeMap:
     """Views of one procedural map, a room for even seeds and an object for odd ones."""
     rng = np.random.default_rng([seed, 77])
     made = make_object(seed) if seed % 2 else make_room(seed)
-    setting = _setting(made, rng, threads)
-    return training_map(f"procedural {seed}", setting, _VIEWS, seed, held_out=_HELD_OUT)
+    is_object = made.kind == "object"
+    sampler = _object_poses(made) if is_object else _room_poses(made, rng)
+    background = rng.random(3) if is_object else np.zeros(3)
+    x, y, z = map(float, sampler.sphere.centre)
+    renderer = ViewRenderer(
+        made.gmap.for_small_images(), _camera(rng.uniform(*_FIELD_DEG[made.kind])),
+        PoseScale((x, y, z), sampler.length), 0.0 if is_object else 0.6, threads,
+    )  # fmt: skip
+    views = draw_views(renderer, sampler, np.random.default_rng(seed), count)
+    return episode_map(
+        views, torch.tensor(background, dtype=torch.float32), lambda_t(made.kind)
+    )
 
 
-def _setting(made: ProceduralMap, rng: np.random.Generator, threads: int) -> Setting:
+def _object_poses(made: ProceduralMap) -> PoseSampler:
     x, y, z = map(float, made.centre)
     sphere = Sphere(made.kind, made.radius, (x, y, z), made.up)
-    if made.kind == "object":
-        sources, length, background = object_sources(sphere, _SOURCES), made.radius, rng.random(3)
-        degrees, covered = rng.uniform(35, 50), 0.0
-        centre = sphere.centre
-        sampler = PoseSampler(sphere, length, sources, 0.0)
-    else:
-        places = made.free_positions(rng, 200)
-        looks = np.array([_look(place, rng) for place in places])
-        x, y, z = map(float, places.mean(0))
-        centre = (x, y, z)
-        length = float(np.linalg.norm(places - centre, axis=1).max())
-        sources, background = looks[spread_indices(looks, _SOURCES, length)], np.zeros(3)
-        degrees, covered = rng.uniform(50, 75), 0.6
-        sampler = PoseSampler(
-            sphere, length, looks, 0.3, lambda rng: made.free_positions(rng, 1)[0]
-        )
+    return PoseSampler(sphere, made.radius, np.zeros((0, 4, 4)), 0.0)
+
+
+def _room_poses(made: ProceduralMap, rng: np.random.Generator) -> PoseSampler:
+    places = made.free_positions(rng, 200)
+    looks = np.array([_look(place, rng) for place in places])
+    x, y, z = map(float, places.mean(0))
+    length = float(np.linalg.norm(places - (x, y, z), axis=1).max())
+    sphere = Sphere(made.kind, made.radius, (x, y, z), made.up)
+    return PoseSampler(sphere, length, looks, 0.3, lambda rng: made.free_positions(rng, 1)[0])
+
+
+def _camera(degrees: float) -> Camera:
     focal = 0.5 * _SIDE / np.tan(0.5 * np.radians(degrees))
-    camera = Camera(_SIDE, _SIDE, focal, focal, 0.5 * (_SIDE - 1), 0.5 * (_SIDE - 1))
-    gmap = made.gmap.for_small_images()
-    renderer = ViewRenderer(gmap, camera, PoseScale(centre, length), covered, threads)
-    return Setting(renderer, sampler, sources, torch.tensor(background, dtype=torch.float32))
+    return Camera(_SIDE, _SIDE, focal, focal, 0.5 * (_SIDE - 1), 0.5 * (_SIDE - 1))
 
 
 def _look(place: Array, rng: np.random.Generator) -> Array:

@@ -22,8 +22,7 @@ from igaussian_core.sphere import Sphere, sphere_of
 from igaussian_core.training.augment import augmented, composite
 from igaussian_core.training.bank import Bank, ViewRenderer, draw_views
 from igaussian_core.training.pose_network import (
-    Curve,
-    Trainer,
+    MapTrainer,
     TrainingMap,
     TrainOptions,
     held_out_errors,
@@ -32,6 +31,7 @@ from igaussian_core.training.pose_network import (
     source_views,
 )
 from igaussian_core.training.poses import PoseSampler
+from igaussian_core.training.trainer import Curve
 from igaussian_core.views import spherical_views, spread_indices
 
 Array = NDArray[np.float64]
@@ -147,7 +147,7 @@ def train_map_network(
     torch.set_num_threads(threads)
     setting = setting_of(package, sources, threads)
     data = training_map(package.manifest.name, setting, bank, options.seed, progress)
-    trainer = Trainer(start, [data], options, checkpoint, threads)
+    trainer = MapTrainer(start, data, options, checkpoint, threads)
     curve = trainer.run(progress)
     count = MEMORY if memory is None else memory
     views = remember(trainer.network, data, setting, count, options.seed, progress)

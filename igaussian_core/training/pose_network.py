@@ -1,33 +1,26 @@
-"""Training of the pose network: on one map, or jointly on many."""
+"""Training of the pose network on one map: its losses, its steps, its errors on held-out views."""
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from igaussian_core.coarse.attention import PoseNetwork, Prediction, SourceViews, orthonormal
 from igaussian_core.coarse.memory import raw_keys
-from igaussian_core.errors import ConfigError
-from igaussian_core.torch_cpu import has_native_bfloat16, one_torch_thread
 from igaussian_core.training.augment import augmented, composite
 from igaussian_core.training.bank import Bank, Views
 from igaussian_core.training.recent_views import RecentViews
-
-Array = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]
+from igaussian_core.training.trainer import Trainer, mixed_precision
 
 _LAMBDA_R = 1.0  # the paper's, on degrees
 _LAMBDA_T = 30.0  # the paper's, on map units where an object's radius is 4
-_CLIP = 50.0
 _SAME_PLACE = 0.08  # lengths
 _COMPARED = 24  # cells of an image, drawn anew each step
 
@@ -39,13 +32,13 @@ class TrainOptions:
     Attributes:
         steps: of the optimiser; 0 leaves the weights as they are.
         batch: target views a step.
-        maps_per_batch: of joint training.
         learning_rate: peak of one cycle.
         refresh: views a step that are rendered anew.
         points: weight of the error of the cells' scene coordinates (ours).
         candidates: weight of the candidates' own errors, each times its weight (ours).
         resemblance: weight of the cells' comparison with the source views' (ours).
-        recall: weight of the error of a memory of the latest views (ours); of one map only.
+        recall: weight of the error of a memory of the latest views (ours).
+        clip: longest gradient.
         seed: of everything random.
         validate_every: steps.
         sources_every: steps after which the source views' features are computed anew.
@@ -53,13 +46,13 @@ class TrainOptions:
 
     steps: int = 3000
     batch: int = 32
-    maps_per_batch: int = 1
     learning_rate: float = 2e-3
     refresh: int = 8
     points: float = 1.0
     candidates: float = 1.0
     resemblance: float = 20.0
     recall: float = 1.0
+    clip: float = 50.0
     seed: int = 0
     validate_every: int = 250
     sources_every: int = 10
@@ -85,19 +78,6 @@ class TrainingMap(NamedTuple):
     background: Tensor
     rays: Tensor
     lambda_t: float
-
-
-@dataclass
-class Curve:
-    """What training wrote down: step, and figures by name."""
-
-    steps: list[int] = field(default_factory=list)
-    values: dict[str, list[float]] = field(default_factory=dict)
-
-    def add(self, step: int, **values: float) -> None:
-        self.steps.append(step)
-        for name, value in values.items():
-            self.values.setdefault(name, []).append(value)
 
 
 def lambda_t(kind: str) -> float:
@@ -183,195 +163,70 @@ def resemblance_loss(
     return -found.mean() if len(found) else resemblance.sum() * 0
 
 
-class Trainer:
-    """Trains a network on maps; `run` may be called again after an interruption.
-
-    Every thread takes its share of a step's images through a copy of the network that has the
-    same parameters; the gradients are averaged. Two threads so take little more than half the
-    time of one; sharing each operation among them gains next to nothing, networks being small.
+class MapTrainer(Trainer):
+    """Trains a network on one map.
 
     Args:
         network: starts from its weights.
-        maps: with banks of the same image size.
         checkpoint: file that an interrupted training goes on from; None: none is written.
-        threads: as many as divide a step's images of each map, and at most so many.
+        threads: as many as divide a step's images, and at most so many.
     """
 
     def __init__(
-        self,
-        network: PoseNetwork,
-        maps: Sequence[TrainingMap],
-        options: TrainOptions,
-        checkpoint: Path | None = None,
-        threads: int = 2,
-    ) -> None:
-        self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.maps, self.options = maps, options
-        self.curve = Curve()
-        self.save_every = 500  # steps
-        self.step = 0
-        self._rng = np.random.default_rng(options.seed)
-        each = options.batch // min(options.maps_per_batch, len(maps))
-        shares = max(n for n in range(1, threads + 1) if each % n == 0)
-        self._copies = [network, *(_sharing_copy(network) for _ in range(shares - 1))]
-        self._randoms = [
-            torch.Generator().manual_seed(1000 * options.seed + i) for i in range(shares)
+        self, network: PoseNetwork, training_map: TrainingMap, options: TrainOptions,
+        checkpoint: Path | None = None, threads: int = 2,
+    ) -> None:  # fmt: skip
+        self._shares = max(n for n in range(1, threads + 1) if options.batch % n == 0)
+        super().__init__(network, options, self._shares, checkpoint, threads)
+        self.map, self.options = training_map, options
+        self._sources: SourceViews | None = None
+        self._recent = RecentViews() if options.recall else None
+
+    def _draw(self) -> list[Views]:
+        # features without gradients: the heads learn to compare, the backbone by the targets
+        if self._sources is None or self.step % self.options.sources_every == 0:
+            self._sources = source_views(self.network, self.map)
+        batch = self.map.bank.batch(self.options.batch)
+        return [
+            batch.at(np.arange(k, len(batch.rgba), self._shares)) for k in range(self._shares)
         ]
-        self._optimizer = torch.optim.AdamW(
-            network.parameters(), lr=options.learning_rate, weight_decay=0.02, fused=True
-        )
-        self._schedule = torch.optim.lr_scheduler.OneCycleLR(
-            self._optimizer, options.learning_rate, total_steps=max(options.steps, 1),
-            pct_start=0.15,
-        )
-        self._sources: dict[int, SourceViews] = {}
-        # keys of several maps cannot be compared
-        self._recent = RecentViews() if options.recall and len(maps) == 1 else None
-        self._checkpoint = checkpoint
-        if checkpoint is not None and checkpoint.is_file():
-            self._resume(checkpoint)
 
-    def run(self, progress: Progress = lambda stage, done, of: None) -> Curve:
-        """Train to the end; the network is in evaluation mode afterwards."""
-        options = self.options
-        for network in self._copies:
-            network.train()
-        with (
-            one_torch_thread(), ThreadPoolExecutor(1) as renderer,
-            ThreadPoolExecutor(len(self._copies), initializer=torch.set_num_threads,
-                               initargs=(1,)) as workers,
-        ):  # fmt: skip
-            pending = renderer.submit(lambda: None)
-            while self.step < options.steps:
-                pending.result()
-                chosen = self._rng.choice(
-                    len(self.maps), min(options.maps_per_batch, len(self.maps)), replace=False
-                )
-                batches = [self.maps[i].bank.batch(options.batch // len(chosen)) for i in chosen]
-                if options.refresh:
-                    bank = self.maps[chosen[0]].bank
-                    pending = renderer.submit(bank.refresh, options.refresh)
-                loss = self._learn(list(chosen), batches, workers)
-                self.step += 1
-                if self.step % options.validate_every == 0 or self.step == options.steps:
-                    self._note(loss)
-                if self._checkpoint is not None and self.step % self.save_every == 0:
-                    self._save(self._checkpoint)
-                progress("training", self.step, options.steps)
-            pending.result()
-        self.network.eval()
-        if self._checkpoint is not None:
-            self._checkpoint.unlink(missing_ok=True)
-        return self.curve
-
-    def _learn(
-        self, chosen: list[int], batches: list[Views], workers: ThreadPoolExecutor
-    ) -> float:
-        """One step of the optimiser; the mean loss."""
-        maps, shares = [self.maps[i] for i in chosen], len(self._copies)
-        sources = [self._source_views(i) for i in chosen]
-        views = SourceViews(*(torch.cat(parts) for parts in zip(*sources, strict=True)))
-        parts = [[b.at(np.arange(k, len(b.rgba), shares)) for b in batches] for k in range(shares)]
-        results = list(workers.map(
-            self._gradients, self._copies, self._randoms, parts, [maps] * shares, [views] * shares
-        ))  # fmt: skip
-        if self._recent is not None:
-            for _, keys, truth in results:
-                self._recent.add(keys, truth)
-        for ours, *theirs in zip(*(n.parameters() for n in self._copies), strict=True):
-            for parameter in theirs:
-                if ours.grad is not None and parameter.grad is not None:
-                    ours.grad += parameter.grad
-            if ours.grad is not None:
-                ours.grad /= shares
-        nn.utils.clip_grad_norm_(self.network.parameters(), _CLIP)
-        self._optimizer.step()
-        self._schedule.step()
-        return float(np.mean([loss for loss, *_ in results]))
+    def _renew(self) -> None:
+        if self.options.refresh:
+            self.map.bank.refresh(self.options.refresh)
 
     def _gradients(
-        self, network: PoseNetwork, random: torch.Generator, batches: list[Views],
-        maps: list[TrainingMap], views: SourceViews,
-    ) -> tuple[float, Tensor, Views]:  # fmt: skip
-        """Leaves the gradients of a share of a step's images in `network`; its `pose_loss`, and
-        the images' raw keys and truth."""
-        images = torch.cat(
-            [augmented(b.rgba, m.background, random) for b, m in zip(batches, maps, strict=True)]
-        )
-        truth = Views(*(torch.cat(parts) for parts in zip(*batches, strict=True)))
-        rays = torch.stack([m.rays for m in maps])
-        weight_t = torch.tensor([m.lambda_t for m in maps]).repeat_interleave(len(batches[0].rgba))
+        self, network: PoseNetwork, random: torch.Generator, share: Views
+    ) -> tuple[float, tuple[Tensor, Views]]:
+        """Of `pose_loss`; besides that the images' raw keys and truth."""
+        assert self._sources is not None
+        data = self.map
+        images = augmented(share.rgba, data.background, random)
+        weight_t = torch.full((len(images),), data.lambda_t)
         network.zero_grad(set_to_none=True)
-        with _mixed_precision():
+        with mixed_precision():
             features = network.backbone(images)
-            prediction = network.predict(features, rays, views)
-        loss = pose_loss(prediction, truth, views, weight_t, self.options, random)
+            prediction = network.predict(features, data.rays[None], self._sources)
+        loss = pose_loss(prediction, share, self._sources, weight_t, self.options, random)
         said = float(loss.detach())  # the same sum from the first step to the last
         keys = raw_keys(features)
         recalled = None if self._recent is None else self._recent.predict(keys)
         if recalled is not None:
-            loss = loss + self.options.recall * recall_loss(recalled, truth, weight_t)
+            loss = loss + self.options.recall * recall_loss(recalled, share, weight_t)
         loss.backward()  # type: ignore[no-untyped-call]
-        return said, keys.detach(), truth
+        return said, (keys.detach(), share)
 
-    def _source_views(self, index: int) -> SourceViews:
-        """Features without gradients: the heads learn to compare, the backbone by the targets."""
-        stale = len(self.maps) > 1 or self.step % self.options.sources_every == 0
-        if stale or index not in self._sources:
-            self._sources[index] = source_views(self.network, self.maps[index])
-        return self._sources[index]
+    def _learned(self, results: Sequence[tuple[Tensor, Views]]) -> None:
+        if self._recent is not None:
+            for keys, truth in results:
+                self._recent.add(keys, truth)
 
-    def _note(self, loss: float) -> None:
-        errors = [held_out_errors(self.network, m) for m in self.maps[:8]]
-        degrees, lengths = (np.concatenate([e[i] for e in errors]) for i in range(2))
-        self.curve.add(
-            self.step, loss=loss, degrees=float(np.median(degrees)),
-            lengths=float(np.median(lengths)), within_15=float((degrees < 15).mean()),
-            learning_rate=float(self._schedule.get_last_lr()[0]),
-        )  # fmt: skip
-
-    def _save(self, path: Path) -> None:
-        state = {
-            "options": asdict(self.options), "step": self.step,
-            "network": self.network.state_dict(), "optimizer": self._optimizer.state_dict(),
-            "schedule": self._schedule.state_dict(), "curve": asdict(self.curve),
-            "random": [random.get_state() for random in self._randoms],
+    def _validate(self) -> dict[str, float]:
+        degrees, lengths = held_out_errors(self.network, self.map)
+        return {
+            "degrees": float(np.median(degrees)), "lengths": float(np.median(lengths)),
+            "within_15": float((degrees < 15).mean()),
         }  # fmt: skip
-        temporary = path.with_name(path.name + ".new")
-        torch.save(state, temporary)
-        temporary.replace(path)
-
-    def _resume(self, path: Path) -> None:
-        try:
-            state: dict[str, Any] = torch.load(path, weights_only=True)
-        except Exception as error:  # pickle and zip raise types of their own
-            raise ConfigError(f"{path}: unreadable checkpoint: {error}") from error
-        if state["options"] != asdict(self.options):
-            raise ConfigError(f"{path}: checkpoint of a training with other options; remove it")
-        self.network.load_state_dict(state["network"])
-        self._optimizer.load_state_dict(state["optimizer"])
-        self._schedule.load_state_dict(state["schedule"])
-        for random, saved in zip(self._randoms, state["random"], strict=False):
-            random.set_state(saved)
-        self.step = int(state["step"])
-        self._rng = np.random.default_rng([self.options.seed, self.step])
-        self.curve = Curve(**state["curve"])
-
-
-def _mixed_precision(enabled: bool = True) -> torch.autocast:
-    """bfloat16 where the CPU computes in it. Without autocast's cache of weights, which is the
-    process's: another thread would empty it halfway."""
-    return torch.autocast(
-        "cpu", torch.bfloat16, enabled=enabled and has_native_bfloat16(), cache_enabled=False
-    )
-
-
-def _sharing_copy(network: PoseNetwork) -> PoseNetwork:
-    """The same parameters; gradients and statistics of its own."""
-    other = copy.deepcopy(network)
-    for ours, theirs in zip(network.parameters(), other.parameters(), strict=True):
-        theirs.data = ours.data
-    return other
 
 
 def source_views(network: PoseNetwork, training_map: TrainingMap) -> SourceViews:
@@ -380,7 +235,7 @@ def source_views(network: PoseNetwork, training_map: TrainingMap) -> SourceViews
     images = composite(views.rgba, training_map.background[None]).permute(0, 3, 1, 2)
     images = images.contiguous(memory_format=torch.channels_last)
     network.eval()
-    with torch.no_grad(), _mixed_precision(training):
+    with torch.no_grad(), mixed_precision(training):
         features = network.backbone(images).float()
     network.train(training)
     return SourceViews(
@@ -402,7 +257,7 @@ def held_out_errors(
     for start in range(0, len(held_out.rgba), chunk):
         part = Views(*(field[start : start + chunk] for field in held_out))
         images = composite(part.rgba, training_map.background[None]).permute(0, 3, 1, 2)
-        with _mixed_precision(training):
+        with mixed_precision(training):
             prediction = network(
                 images.contiguous(memory_format=torch.channels_last), training_map.rays[None],
                 sources,

@@ -46,7 +46,7 @@ from igaussian_core.training.map_network import (
     training_map,
 )
 from igaussian_core.training.pose_network import (
-    Trainer,
+    MapTrainer,
     TrainOptions,
     held_out_errors,
     recall_loss,
@@ -173,22 +173,22 @@ OPTIONS = TrainOptions(steps=60, batch=16, learning_rate=2e-3, validate_every=30
 
 
 @pytest.fixture(scope="module")
-def learned(package: MapPackage, setting: Setting) -> tuple[MapNetwork, Trainer]:
+def learned(package: MapPackage, setting: Setting) -> tuple[MapNetwork, MapTrainer]:
     """A network after some seconds of training in the test's room."""
     torch.manual_seed(0)
     data = training_map("room", setting, 192, 0, held_out=48)
-    trainer = Trainer(PoseNetwork(SMALL), [data], OPTIONS)
+    trainer = MapTrainer(PoseNetwork(SMALL), data, OPTIONS)
     trainer.run()
     memory = remember(trainer.network, data, setting, 400, seed=0)
     return trained_network(trainer.network, data, setting, OPTIONS, memory), trainer
 
 
 def test_training_lowers_the_error_on_views_it_has_not_seen(
-    learned: tuple[MapNetwork, Trainer], setting: Setting
+    learned: tuple[MapNetwork, MapTrainer], setting: Setting
 ) -> None:
     trained, trainer = learned
     torch.manual_seed(0)
-    before = np.median(held_out_errors(PoseNetwork(SMALL).eval(), trainer.maps[0])[0])
+    before = np.median(held_out_errors(PoseNetwork(SMALL).eval(), trainer.map)[0])
     report = trained.report
     assert report["held_out_views"] == 48
     assert report["median_deg"] < 0.7 * before
@@ -236,19 +236,19 @@ def test_an_interrupted_training_goes_on(setting: Setting, tmp_path: Path) -> No
         if done == 5:
             raise Stop
 
-    first = Trainer(PoseNetwork(SMALL), [data], options, checkpoint)
+    first = MapTrainer(PoseNetwork(SMALL), data, options, checkpoint)
     first.save_every = 4
     with pytest.raises(Stop):
         first.run(stop)
     assert checkpoint.is_file()
-    second = Trainer(PoseNetwork(SMALL), [data], options, checkpoint)
+    second = MapTrainer(PoseNetwork(SMALL), data, options, checkpoint)
     assert second.step == 4
     curve = second.run()
     assert curve.steps == [4, 8] and not checkpoint.exists()
 
     checkpoint.write_text("nothing")
     with pytest.raises(ConfigError, match="unreadable checkpoint"):
-        Trainer(PoseNetwork(SMALL), [data], options, checkpoint)
+        MapTrainer(PoseNetwork(SMALL), data, options, checkpoint)
 
 
 def test_the_same_seed_gives_the_same_network(setting: Setting) -> None:
@@ -257,14 +257,14 @@ def test_the_same_seed_gives_the_same_network(setting: Setting) -> None:
         torch.manual_seed(0)
         data = training_map("room", setting, 48, 0, held_out=8)
         options = dataclasses.replace(OPTIONS, steps=4, validate_every=4)
-        trainer = Trainer(PoseNetwork(SMALL), [data], options)
+        trainer = MapTrainer(PoseNetwork(SMALL), data, options)
         trainer.run()
         weights.append(trainer.network.state_dict()["decode.weight"].clone())
     assert torch.equal(*weights)
 
 
 def test_a_map_keeps_its_network(
-    learned: tuple[MapNetwork, Trainer], package: MapPackage
+    learned: tuple[MapNetwork, MapTrainer], package: MapPackage
 ) -> None:
     trained, _ = learned
     again = MapNetwork.from_data(trained.data(), "here")
@@ -280,7 +280,7 @@ def test_a_map_keeps_its_network(
 
 @pytest.mark.parametrize("head", ["memory", "attention"])
 def test_hypotheses_differ_from_each_other(
-    learned: tuple[MapNetwork, Trainer], head: str
+    learned: tuple[MapNetwork, MapTrainer], head: str
 ) -> None:
     trained, _ = learned
     image = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
@@ -291,18 +291,18 @@ def test_hypotheses_differ_from_each_other(
 
 
 def test_the_memory_knows_the_map_better_than_the_heads(
-    learned: tuple[MapNetwork, Trainer], setting: Setting
+    learned: tuple[MapNetwork, MapTrainer], setting: Setting
 ) -> None:
     """After seconds of training, which are too few for the heads."""
     trained, trainer = learned
-    by_heads = np.median(held_out_errors(trained.network, trainer.maps[0])[0])
+    by_heads = np.median(held_out_errors(trained.network, trainer.map)[0])
     assert trained.report["memory"] == 400
     assert trained.report["median_deg"] < 0.8 * by_heads
     assert not trained.network.training
 
 
 def test_an_old_network_without_a_memory_predicts_by_its_heads(
-    learned: tuple[MapNetwork, Trainer]
+    learned: tuple[MapNetwork, MapTrainer]
 ) -> None:
     data = learned[0].data()
     tensors = {k: v for k, v in data.tensors.items() if not k.startswith("memory.")}
@@ -317,7 +317,7 @@ def test_an_old_network_without_a_memory_predicts_by_its_heads(
 
 @pytest.mark.parametrize("damage", ["missing", "extra", "shape", "memory", "nan", "format"])
 def test_damaged_networks_are_refused(
-    learned: tuple[MapNetwork, Trainer], damage: str
+    learned: tuple[MapNetwork, MapTrainer], damage: str
 ) -> None:
     data = learned[0].data()
     tensors, meta = dict(data.tensors), dict(data.meta)
@@ -368,7 +368,7 @@ def test_training_may_be_left_out(package: MapPackage) -> None:
     assert trained.memory is None and trained.report["memory"] == 0
 
 
-def test_curves(learned: tuple[MapNetwork, Trainer], tmp_path: Path) -> None:
+def test_curves(learned: tuple[MapNetwork, MapTrainer], tmp_path: Path) -> None:
     curve = learned[1].curve
     plot_curve(curve, tmp_path / "curve.png")
     picture = cv2.imread(str(tmp_path / "curve.png"))
@@ -378,7 +378,7 @@ def test_curves(learned: tuple[MapNetwork, Trainer], tmp_path: Path) -> None:
 
 
 def test_the_localizer_asks_the_network_first(
-    learned: tuple[MapNetwork, Trainer], package: MapPackage
+    learned: tuple[MapNetwork, MapTrainer], package: MapPackage
 ) -> None:
     """After seconds of training it is far off: in the cascade the landmarks take over, and are
     asked first where the network's report says so."""

@@ -1,0 +1,213 @@
+"""Training over many maps so that the memory (`coarse/memory.py`) works on maps never seen.
+
+No head is trained, since what it would learn of one map means nothing in another. Each share of a
+step is an episode, as in few-shot learning: some views of one map, a part of them near one another,
+and of each it is asked what pose the memory's regression would tell from all the others. That
+leave-one-out prediction has a closed form (Rasmussen and Williams 2006, equation 5.12)
+
+    y_i - [K^-1 y]_i / [K^-1]_ii
+
+through which gradients reach the keys of all views (deep kernel learning: Wilson et al. 2016, over
+episodes: Patacchiola et al. 2020). Besides, cells of different views that show the same place are
+to resemble each other more than others (the InfoNCE loss of van den Oord et al. 2018).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from igaussian_core.coarse.attention import PoseNetwork, orthonormal
+from igaussian_core.coarse.memory import matern, raw_keys
+from igaussian_core.training.augment import augmented, composite
+from igaussian_core.training.bank import Views
+from igaussian_core.training.pose_network import rotation_error_deg
+from igaussian_core.training.trainer import Trainer, mixed_precision
+
+_RIDGE = 0.02
+_NEAR = (0.3, 1.0)  # share of an episode's views that are near one another, drawn evenly
+_AMONG = 2  # they are drawn among so many times as many
+_HALF_LOST = 5.0  # degrees at which an error counts half as steeply as at zero
+_SAME_PLACE = 0.08  # lengths
+_CELLS = 640  # compared in an episode
+_SHARPNESS = 1 / 0.07
+
+
+@dataclass(frozen=True)
+class EpisodeOptions:
+    """How long and how.
+
+    Attributes:
+        steps: of the optimiser.
+        views: of an episode.
+        maps: a step, an episode of each.
+        learning_rate: peak of one cycle.
+        places: weight of the comparison of cells.
+        clip: longest gradient.
+        seed: of everything random.
+        validate_every: steps.
+    """
+
+    steps: int = 1500
+    views: int = 48
+    maps: int = 2
+    learning_rate: float = 1.5e-3
+    places: float = 0.1
+    clip: float = 1.0
+    seed: int = 0
+    validate_every: int = 100
+
+
+class EpisodeMap(NamedTuple):
+    """Views of a map.
+
+    Attributes:
+        views: rendered.
+        background: [3] float32 in [0, 1].
+        lambda_t: degrees that a unit of length counts.
+        nearest: int64 [N, N], of each view all views, the most alike poses first.
+    """
+
+    views: Views
+    background: Tensor
+    lambda_t: float
+    nearest: Tensor
+
+
+class Episode(NamedTuple):
+    """Some views of a map, the first `near` of them near one another."""
+
+    of: EpisodeMap
+    views: Views
+    near: int
+
+
+def episode_map(views: Views, background: Tensor, lambda_t: float) -> EpisodeMap:
+    """With the order of its views by their distances."""
+    turns = views.rotation.flatten(1)
+    angles = 2 * torch.arcsin((torch.cdist(turns, turns) / 8**0.5).clamp(max=1))
+    apart = torch.rad2deg(angles) + lambda_t * torch.cdist(views.position, views.position)
+    return EpisodeMap(views, background, lambda_t, apart.argsort(1))
+
+
+def leave_one_out(keys: Tensor, poses: Tensor) -> Tensor:
+    """Of N views the poses [N, 12] that a regression by the keys [N, D] of the others tells."""
+    keys = keys - keys.mean(0)
+    squares = keys.square().sum(1)
+    distances = (squares[:, None] + squares - 2 * keys @ keys.T).clamp(min=0).add(1e-6).sqrt()
+    gram = matern(distances, distances.detach().median())
+    inverse = torch.cholesky_inverse(
+        torch.linalg.cholesky(gram + _RIDGE * torch.eye(len(keys)))
+    )
+    return poses - inverse @ (poses - poses.mean(0)) / inverse.diagonal()[:, None]
+
+
+def pose_errors(predicted: Tensor, views: Views) -> tuple[Tensor, Tensor]:
+    """Degrees [N] and lengths [N] of poses [N, 12], rotation by rows and position."""
+    rotation = orthonormal(predicted[:, :9].unflatten(1, (3, 3))[..., :2])
+    away = (predicted[:, 9:] - views.position).square().sum(1).add(1e-6).sqrt()
+    return rotation_error_deg(rotation, views.rotation), away
+
+
+def place_loss(features: Tensor, views: Views, random: torch.Generator) -> Tensor:
+    """How little cells [N, C, h, w] resemble those of other views that show the same place: minus
+    the logarithm of their share of the resemblance to all other views' cells."""
+    count, _, height, width = features.shape
+    shown = torch.nonzero(views.known.flatten()).flatten()
+    chosen = shown[torch.randperm(len(shown), generator=random)[:_CELLS]]
+    if len(chosen) < 2:
+        return features.sum() * 0
+    cells = features.permute(0, 2, 3, 1).flatten(0, 2)[chosen]
+    cells = F.normalize(cells - cells.mean(0), dim=1)
+    places = views.points.flatten(0, 2)[chosen]
+    view = torch.arange(count).repeat_interleave(height * width)[chosen]
+    other = view[:, None] != view
+    same = other & (torch.cdist(places, places) < _SAME_PLACE)
+    seen_again = same.any(1)
+    if not seen_again.any():
+        return features.sum() * 0
+    shares = torch.log_softmax((_SHARPNESS * cells @ cells.T).masked_fill(~other, -1e4), 1)
+    found = shares.masked_fill(~same, -torch.inf)[seen_again]
+    return -torch.logsumexp(found, 1).mean()
+
+
+class EpisodeTrainer(Trainer):
+    """Trains a network's backbone on episodes of many maps.
+
+    Args:
+        maps: to train on.
+        held_out: maps that the curve is measured on.
+        checkpoint, threads: as of `Trainer`.
+    """
+
+    def __init__(
+        self, network: PoseNetwork, maps: Sequence[EpisodeMap], held_out: Sequence[EpisodeMap],
+        options: EpisodeOptions, checkpoint: Path | None = None, threads: int = 2,
+    ) -> None:  # fmt: skip
+        super().__init__(network, options, min(options.maps, len(maps)), checkpoint, threads)
+        self._maps, self._held_out, self._options = maps, held_out, options
+
+    def _draw(self) -> list[Episode]:
+        chosen = self._rng.choice(len(self._maps), len(self._copies), replace=False)
+        return [self._episode(self._maps[index]) for index in chosen]
+
+    def _episode(self, of: EpisodeMap) -> Episode:
+        total = len(of.nearest)
+        count = min(self._options.views, total)
+        near = int(count * self._rng.uniform(*_NEAR))
+        around = of.nearest[self._rng.integers(total)][: _AMONG * near].numpy()
+        first = self._rng.choice(around, near, replace=False)
+        rest = self._rng.choice(np.setdiff1d(np.arange(total), first), count - near, replace=False)
+        return Episode(of, of.views.at(np.concatenate([first, rest])), near)
+
+    def _gradients(
+        self, network: PoseNetwork, random: torch.Generator, share: Episode
+    ) -> tuple[float, None]:
+        of, views, near = share
+        images = augmented(views.rgba, of.background, random)
+        network.zero_grad(set_to_none=True)
+        with mixed_precision():
+            features = network.backbone(images)
+        features = features.float()
+        degrees, lengths = pose_errors(leave_one_out(raw_keys(features), _poses(views)), views)
+        # those that nothing near tells of are past help
+        loss = torch.log1p((degrees + of.lambda_t * lengths) / _HALF_LOST).mean()
+        neighbours = views.at(np.arange(near))
+        loss = loss + self._options.places * place_loss(features[:near], neighbours, random)
+        loss.backward()  # type: ignore[no-untyped-call]
+        return float(loss.detach()), None
+
+    @torch.no_grad()
+    def _validate(self) -> dict[str, float]:
+        self.network.eval()
+        found = [leave_one_out_errors(self.network, of) for of in self._held_out]
+        self.network.train()
+        degrees, lengths = (torch.cat(part) for part in zip(*found, strict=True))
+        return {
+            "degrees": float(degrees.median()), "lengths": float(lengths.median()),
+            "within_15": float((degrees < 15).float().mean()),
+        }  # fmt: skip
+
+
+@torch.no_grad()
+def leave_one_out_errors(
+    network: PoseNetwork, of: EpisodeMap, chunk: int = 64
+) -> tuple[Tensor, Tensor]:
+    """Degrees [N] and lengths [N] of a map's views, each by all of the others."""
+    keys = []
+    for rgba in of.views.rgba.split(chunk):
+        images = composite(rgba, of.background[None]).permute(0, 3, 1, 2)
+        images = images.contiguous(memory_format=torch.channels_last)
+        keys.append(raw_keys(network.backbone(images)))
+    return pose_errors(leave_one_out(torch.cat(keys), _poses(of.views)), of.views)
+
+
+def _poses(views: Views) -> Tensor:
+    return torch.cat([views.rotation.flatten(1), views.position], 1)
