@@ -61,7 +61,7 @@ from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import MapPackage
 from igaussian_core.posed_images import PosedImage
 from igaussian_core.sphere import sphere_of
-from igaussian_core.training.map_network import OPTIONS
+from igaussian_core.training.map_network import FROM_WEIGHTS
 from igaussian_core.view_planning import SourceView
 from igaussian_core.views import spherical_views
 
@@ -115,7 +115,7 @@ SIFT = dataclasses.replace(CONFIG, features=dataclasses.replace(CONFIG.features,
 
 def _with_network(case: Case) -> MapPackage:
     """The case's map with the network that stage_one.py trained on it."""
-    network = trained_network(case.map, OPTIONS.steps)
+    network = trained_network(case.map, FROM_WEIGHTS.steps)
     if network is None:
         raise NotBuilt("a pose network trained on the map: python benchmarks/stage_one.py")
     return dataclasses.replace(case.package, network=network)

@@ -1,10 +1,10 @@
 """Stage one alone: what the pose network reaches on each map, and what each of its parts adds.
 
-    python benchmarks/stage_one.py [--json out.json] [--steps 2000] [--short-steps 300]
+    python benchmarks/stage_one.py [--json out.json] [--steps 1000] [--short-steps 300]
                                    [--work folder] [--only maps|ablation|views]
 
 `maps`: per map the shipped joint weights without training, the network trained on the map from
-random weights, and the landmarks, on the paper's protocol (300 rendered targets) and on
+those, and the landmarks, on the paper's protocol (300 rendered targets) and on
 held-out photos. `ablation` (the paper's table 4, stage one) and `views` (figure 5): lego, from
 random weights with --short-steps each, so that only the part in question differs. Networks
 predict by their heads ("heads": candidates and weights of the source views) and by the memory
@@ -41,7 +41,13 @@ from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.evaluate.runner import Queries, run
 from igaussian_core.map_package import MapPackage, NetworkData, read_tensors
 from igaussian_core.sphere import sphere_of
-from igaussian_core.training.map_network import MEMORY, OPTIONS, train_map_network
+from igaussian_core.training.map_network import (
+    FROM_WEIGHTS,
+    MEMORY,
+    OPTIONS,
+    train_map_network,
+)
+from igaussian_core.training.pose_network import TrainOptions
 
 MAPS = ("lego", DEMO_ROOM, "redkitchen", "fox", "flower")
 VIEW_COUNTS = (8, 12, 16, 20)
@@ -63,7 +69,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, help="where to write all figures")
     parser.add_argument("--work", type=Path, default=STAGE_ONE)
-    parser.add_argument("--steps", type=int, default=OPTIONS.steps)
+    parser.add_argument("--steps", type=int, default=FROM_WEIGHTS.steps)
     parser.add_argument("--short-steps", type=int, default=300)
     parser.add_argument("--targets", type=int, default=100, help="in each of three bins")
     parser.add_argument("--threads", type=int, default=2)
@@ -74,8 +80,8 @@ def main() -> None:
     tables = {"maps": maps_table, "ablation": ablation_table, "views": views_table}
     report: dict[str, Any] = {"facts": {**machine_facts(), "commit": commit()}}
     report["facts"]["training"] = (
-        f"{options.steps} steps of {OPTIONS.batch} views a map; ablation and views "
-        f"{options.short_steps} steps from random weights, {SHORT_MEMORY} views remembered"
+        f"{options.steps} steps of {OPTIONS.batch} views a map from the joint weights; ablation "
+        f"and views {options.short_steps} steps from random weights, {SHORT_MEMORY} views remembered"
     )
     report["facts"]["queries"] = f"{options.targets} rendered targets a bin, held-out photos"
     for name, make in tables.items():
@@ -91,12 +97,11 @@ def maps_table(options: argparse.Namespace) -> list[dict[str, Any]]:
         package = compiled(options.work, name)
         for label, steps in (("joint weights, map never seen", 0),
                              ("network trained on the map", options.steps)):  # fmt: skip
-            torch.manual_seed(0)
-            start = PoseNetwork(NetworkConfig()) if steps else load_checkpoint(shipped_checkpoint())
             trained = _trained(
-                package, start, steps, 16, MEMORY, network_file(name, steps, options.work),
-                options.threads,
-            )
+                package, load_checkpoint(shipped_checkpoint()),
+                dataclasses.replace(FROM_WEIGHTS, steps=steps), 16, MEMORY,
+                network_file(name, steps, options.work), options.threads,
+            )  # fmt: skip
             rows += _judged(package, name, label, trained, options)
         rows += _judged(package, name, "landmarks (no training)", None, options)
     return rows
@@ -123,7 +128,8 @@ def _short_trainings(
     for label, config, sources, file in parts:
         torch.manual_seed(0)
         trained = _trained(
-            package, PoseNetwork(config), options.short_steps, sources, SHORT_MEMORY,
+            package, PoseNetwork(config), dataclasses.replace(OPTIONS, steps=options.short_steps),
+            sources, SHORT_MEMORY,
             options.work / f"{file}-{options.short_steps}.safetensors", options.threads,
         )  # fmt: skip
         rows += _judged(package, "lego", label, trained, options)
@@ -131,19 +137,18 @@ def _short_trainings(
 
 
 def _trained(
-    package: MapPackage, start: PoseNetwork, steps: int, sources: int, memory: int, file: Path,
-    threads: int,
+    package: MapPackage, start: PoseNetwork, options: TrainOptions, sources: int, memory: int,
+    file: Path, threads: int,
 ) -> NetworkData:  # fmt: skip
     """A network trained on a map; from `file` where it is there."""
     if not file.is_file():
         began = time.perf_counter()
-        options = dataclasses.replace(OPTIONS, steps=steps)
         trained, _ = train_map_network(
-            package, start, options, sources=sources, bank=6000 if steps else 8, memory=memory,
-            threads=threads,
+            package, start, options, sources=sources, bank=6000 if options.steps else 8,
+            memory=memory, threads=threads,
         )  # fmt: skip
         data = trained.data()
-        facts = {"seconds": str(time.perf_counter() - began), "steps": str(steps)}
+        facts = {"seconds": str(time.perf_counter() - began), "steps": str(options.steps)}
         save_file(data.tensors, str(file), {**data.meta, **facts})
     return read_tensors(file)
 

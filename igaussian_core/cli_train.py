@@ -25,7 +25,8 @@ SeedOption = Annotated[int, typer.Option(help="of everything random")]
 CurvesOption = Annotated[Path | None, typer.Option(help="picture of the curves")]
 BoardOption = Annotated[Path | None, typer.Option(help="folder that TensorBoard reads")]
 AttentionOption = Annotated[
-    str, typer.Option(help="of random weights: tokens, views, none; paper; plain regression")
+    str | None,
+    typer.Option(help="of random weights: tokens (default), views, none; paper; plain regression"),
 ]
 
 
@@ -34,8 +35,10 @@ def train_map(
     map_path: Annotated[Path, typer.Argument(help="compiled map directory (.igmap)")],
     steps: StepsOption = None,
     start: Annotated[
-        str, typer.Option(help="random; joint: the shipped weights; or a checkpoint file")
-    ] = "random",
+        str | None,
+        typer.Option(help="joint: the shipped weights; random; a checkpoint file; default: joint, "
+                     "or random where --attention is given"),
+    ] = None,
     sources: Annotated[int, typer.Option(help="source views", min=1, max=64)] = 16,
     bank: Annotated[int, typer.Option(help="rendered views kept at a time", min=32)] = 6000,
     memory: Annotated[
@@ -44,7 +47,7 @@ def train_map(
     seed: SeedOption = 0,
     curves: CurvesOption = None,
     tensorboard: BoardOption = None,
-    attention: AttentionOption = "tokens",
+    attention: AttentionOption = None,
     config: ConfigOption = None,
     set_: SetOption = None,
 ) -> None:
@@ -53,10 +56,11 @@ def train_map(
     An interrupted training goes on where it was when the same command is given again.
     """
     from igaussian_core.map_package import open_package, with_network
-    from igaussian_core.training.map_network import OPTIONS, train_map_network
+    from igaussian_core.training.map_network import FROM_WEIGHTS, OPTIONS, train_map_network
 
     package = open_package(map_path)
-    options = _options(OPTIONS, steps, seed)
+    start = start or ("random" if attention else "joint")
+    options = _options(OPTIONS if start == "random" else FROM_WEIGHTS, steps, seed)
     threads = load_config(config, set_).runtime.threads
     with progress_bars() as progress:
         trained, curve = train_map_network(
@@ -77,7 +81,7 @@ def train_joint(
     seed: SeedOption = 0,
     curves: CurvesOption = None,
     tensorboard: BoardOption = None,
-    attention: AttentionOption = "tokens",
+    attention: AttentionOption = None,
     threads: Annotated[int, typer.Option(help="of network and renderer", min=1)] = 2,
 ) -> None:
     """Train one network on many procedural maps: what `train map` starts from."""
@@ -145,18 +149,22 @@ def _options(options: Any, steps: int | None, seed: int) -> Any:
     return dataclasses.replace(options, seed=seed, steps=options.steps if steps is None else steps)
 
 
-def _start(start: str, attention: str) -> Any:
+def _start(start: str, attention: str | None) -> Any:
     from igaussian_core.coarse.attention import PoseNetwork
     from igaussian_core.coarse.network import load_checkpoint, shipped_checkpoint
 
     if start == "random":
         return PoseNetwork(_config(attention))
+    if attention is not None:
+        raise ConfigError(f"--attention {attention}: of --start random; {start} has its own")
     return load_checkpoint(shipped_checkpoint() if start == "joint" else Path(start))
 
 
-def _config(attention: str) -> Any:
+def _config(attention: str | None) -> Any:
     from igaussian_core.coarse.attention import ATTENTIONS, PAPER, PLAIN, NetworkConfig
 
+    if attention is None:
+        return NetworkConfig()
     whole = {"paper": PAPER, "plain": PLAIN}
     if attention in whole:
         return whole[attention]

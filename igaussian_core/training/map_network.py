@@ -37,7 +37,8 @@ from igaussian_core.views import spherical_views, spread_indices
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
-OPTIONS = TrainOptions(steps=2000)
+OPTIONS = TrainOptions(steps=2000)  # from random weights
+FROM_WEIGHTS = TrainOptions(steps=1000, learning_rate=1e-3)  # of a joint training
 BANK = 6000
 MEMORY = 12000
 HELD_OUT = 256

@@ -119,3 +119,5 @@ def test_other_networks_can_be_trained(copied: Path, attention: str) -> None:
 def test_an_unknown_network_is_named(copied: Path) -> None:
     with pytest.raises(ConfigError, match="--attention more: none of tokens"):
         run("train", "map", copied, "--attention", "more")
+    with pytest.raises(ConfigError, match="--attention plain: of --start random; joint has"):
+        run("train", "map", copied, "--attention", "plain", "--start", "joint")
