@@ -81,7 +81,7 @@ def main() -> None:
     report: dict[str, Any] = {"facts": {**machine_facts(), "commit": commit()}}
     report["facts"]["training"] = (
         f"{options.steps} steps of {OPTIONS.batch} views a map from the joint weights; ablation "
-        f"and views {options.short_steps} steps from random weights, {SHORT_MEMORY} views remembered"
+        f"and views {options.short_steps} steps from random weights, {SHORT_MEMORY} remembered"
     )
     report["facts"]["queries"] = f"{options.targets} rendered targets a bin, held-out photos"
     for name, make in tables.items():
