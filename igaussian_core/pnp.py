@@ -121,13 +121,14 @@ def pose_covariance(
     J = _pixel_by_pose(camera, rotation, offsets) / scale
     cell, counts = _cells(projected, cell_px)
     pulls = np.zeros((len(counts), 6))
-    np.add.at(pulls, cell, np.einsum("nij,ni->nj", J, residuals))
+    np.add.at(pulls, cell, (J * residuals[:, :, None]).sum(1))
+    rows, share = J.reshape(-1, 6), np.repeat(1 / counts[cell], 2)[:, None]
     # steps of the pose by which each cell's matches alone would move it
-    steps = pulls @ _inverse(np.einsum("nij,nik->jk", J, J))
+    steps = pulls @ _inverse(rows.T @ rows)
     fitted = len(counts) / max(len(counts) - 6, 1)  # six numbers were
     robust = fitted * steps.T @ steps
     variance = max(float(np.square(residuals).mean()), _LEAST_SIGMA_PX**2)
-    alike = variance * _inverse(np.einsum("nij,nik,n->jk", J, J, 1 / counts[cell]))
+    alike = variance * _inverse(rows.T @ (share * rows))
     covariance = robust + min(6 / len(counts), 1.0) * alike
     covariance /= np.outer(scale, scale)
     return np.asarray(0.5 * (covariance + covariance.T))
