@@ -95,8 +95,10 @@ def maps_table(options: argparse.Namespace) -> list[dict[str, Any]]:
     rows = []
     for name in options.maps.split(","):
         package = compiled(options.work, name)
-        for label, steps in (("joint weights, map never seen", 0),
-                             ("network trained on the map", options.steps)):  # fmt: skip
+        for label, steps in (
+            ("joint weights, map never seen", 0),
+            ("trained on the map, from the joint weights", options.steps),
+        ):
             trained = _trained(
                 package, load_checkpoint(shipped_checkpoint()),
                 dataclasses.replace(FROM_WEIGHTS, steps=steps), 16, MEMORY,

@@ -18,6 +18,12 @@ def composite(rgba: Tensor, background: Tensor) -> Tensor:
     return rgba[..., :3].float() / 255 + (1 - alpha) * background[:, None, None]
 
 
+def unchanged(rgba: Tensor, background: Tensor) -> Tensor:
+    """Float images [B, 3, H, W] in [0, 1] of uint8 [B, H, W, 4] over a colour [3]."""
+    images = composite(rgba, background[None]).permute(0, 3, 1, 2)
+    return images.contiguous(memory_format=torch.channels_last)
+
+
 def augmented(rgba: Tensor, background: Tensor, generator: torch.Generator) -> Tensor:
     """Float images [B, 3, H, W] in [0, 1] with changes drawn anew for each.
 

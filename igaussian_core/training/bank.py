@@ -45,6 +45,11 @@ class Views(NamedTuple):
     rotation: Tensor
     position: Tensor
 
+    @property
+    def poses(self) -> Tensor:
+        """[N, 12], rotation by rows and position: what a regression predicts."""
+        return torch.cat([self.rotation.flatten(1), self.position], 1)
+
     def at(self, index: NDArray[np.int64]) -> Views:
         """Some of them."""
         chosen = torch.from_numpy(index)

@@ -21,14 +21,15 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from igaussian_core.coarse.attention import PoseNetwork, orthonormal
+from igaussian_core.coarse.attention import PoseNetwork
 from igaussian_core.coarse.memory import matern, raw_keys
-from igaussian_core.training.augment import augmented, composite
+from igaussian_core.training.augment import augmented, unchanged
 from igaussian_core.training.bank import Views
-from igaussian_core.training.pose_network import rotation_error_deg
+from igaussian_core.training.pose_network import pose_errors
 from igaussian_core.training.trainer import Trainer, mixed_precision
 
 _RIDGE = 0.02
@@ -109,13 +110,6 @@ def leave_one_out(keys: Tensor, poses: Tensor) -> Tensor:
     return poses - inverse @ (poses - poses.mean(0)) / inverse.diagonal()[:, None]
 
 
-def pose_errors(predicted: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-    """Degrees [N] and lengths [N] of poses [N, 12], rotation by rows and position."""
-    rotation = orthonormal(predicted[:, :9].unflatten(1, (3, 3))[..., :2])
-    away = (predicted[:, 9:] - views.position).square().sum(1).add(1e-6).sqrt()
-    return rotation_error_deg(rotation, views.rotation), away
-
-
 def place_loss(features: Tensor, views: Views, random: torch.Generator) -> Tensor:
     """How little cells [N, C, h, w] resemble those of other views that show the same place: minus
     the logarithm of their share of the resemblance to all other views' cells."""
@@ -176,7 +170,7 @@ class EpisodeTrainer(Trainer):
         with mixed_precision():
             features = network.backbone(images)
         features = features.float()
-        degrees, lengths = pose_errors(leave_one_out(raw_keys(features), _poses(views)), views)
+        degrees, lengths = pose_errors(leave_one_out(raw_keys(features), views.poses), views)
         # those that nothing near tells of are past help
         loss = torch.log1p((degrees + of.lambda_t * lengths) / _HALF_LOST).mean()
         neighbours = views.at(np.arange(near))
@@ -184,16 +178,12 @@ class EpisodeTrainer(Trainer):
         loss.backward()  # type: ignore[no-untyped-call]
         return float(loss.detach()), None
 
-    @torch.no_grad()
-    def _validate(self) -> dict[str, float]:
+    def _errors(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         self.network.eval()
         found = [leave_one_out_errors(self.network, of) for of in self._held_out]
         self.network.train()
-        degrees, lengths = (torch.cat(part) for part in zip(*found, strict=True))
-        return {
-            "degrees": float(degrees.median()), "lengths": float(lengths.median()),
-            "within_15": float((degrees < 15).float().mean()),
-        }  # fmt: skip
+        degrees, lengths = (torch.cat(part).numpy() for part in zip(*found, strict=True))
+        return degrees, lengths
 
 
 @torch.no_grad()
@@ -201,13 +191,8 @@ def leave_one_out_errors(
     network: PoseNetwork, of: EpisodeMap, chunk: int = 64
 ) -> tuple[Tensor, Tensor]:
     """Degrees [N] and lengths [N] of a map's views, each by all of the others."""
-    keys = []
-    for rgba in of.views.rgba.split(chunk):
-        images = composite(rgba, of.background[None]).permute(0, 3, 1, 2)
-        images = images.contiguous(memory_format=torch.channels_last)
-        keys.append(raw_keys(network.backbone(images)))
-    return pose_errors(leave_one_out(torch.cat(keys), _poses(of.views)), of.views)
-
-
-def _poses(views: Views) -> Tensor:
-    return torch.cat([views.rotation.flatten(1), views.position], 1)
+    keys = [
+        raw_keys(network.backbone(unchanged(rgba, of.background)))
+        for rgba in of.views.rgba.split(chunk)
+    ]
+    return pose_errors(leave_one_out(torch.cat(keys), of.views.poses), of.views)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from igaussian_core.coarse.attention import PoseNetwork, Prediction, SourceViews, orthonormal
 from igaussian_core.coarse.memory import raw_keys
-from igaussian_core.training.augment import augmented, composite
+from igaussian_core.training.augment import augmented, unchanged
 from igaussian_core.training.bank import Bank, Views
 from igaussian_core.training.recent_views import RecentViews
 from igaussian_core.training.trainer import Trainer, mixed_precision
@@ -136,9 +136,15 @@ def pose_loss(
 
 def recall_loss(poses: Tensor, truth: Views, weight_t: Tensor) -> Tensor:
     """lambda_r * degrees + lambda_t * distance of what `RecentViews` predicts, [B, 12]."""
+    degrees, lengths = pose_errors(poses, truth)
+    return (_LAMBDA_R * degrees + weight_t * lengths).mean()
+
+
+def pose_errors(poses: Tensor, truth: Views) -> tuple[Tensor, Tensor]:
+    """Degrees [B] and lengths [B] of predicted `Views.poses` [B, 12]."""
     rotation = orthonormal(poses[:, :9].unflatten(1, (3, 3))[..., :2])
-    loss = _LAMBDA_R * rotation_error_deg(rotation, truth.rotation)
-    return (loss + weight_t * _distance(poses[:, 9:], truth.position)).mean()
+    degrees = rotation_error_deg(rotation, truth.rotation)
+    return degrees, _distance(poses[:, 9:], truth.position)
 
 
 def resemblance_loss(
@@ -221,19 +227,14 @@ class MapTrainer(Trainer):
             for keys, truth in results:
                 self._recent.add(keys, truth)
 
-    def _validate(self) -> dict[str, float]:
-        degrees, lengths = held_out_errors(self.network, self.map)
-        return {
-            "degrees": float(np.median(degrees)), "lengths": float(np.median(lengths)),
-            "within_15": float((degrees < 15).mean()),
-        }  # fmt: skip
+    def _errors(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return held_out_errors(self.network, self.map)
 
 
 def source_views(network: PoseNetwork, training_map: TrainingMap) -> SourceViews:
     """Features of a map's source views by the network as it is now; leaves it in its mode."""
     views, training = training_map.sources, network.training
-    images = composite(views.rgba, training_map.background[None]).permute(0, 3, 1, 2)
-    images = images.contiguous(memory_format=torch.channels_last)
+    images = unchanged(views.rgba, training_map.background)
     network.eval()
     with torch.no_grad(), mixed_precision(training):
         features = network.backbone(images).float()
@@ -256,12 +257,9 @@ def held_out_errors(
     degrees, lengths = [], []
     for start in range(0, len(held_out.rgba), chunk):
         part = Views(*(field[start : start + chunk] for field in held_out))
-        images = composite(part.rgba, training_map.background[None]).permute(0, 3, 1, 2)
+        images = unchanged(part.rgba, training_map.background)
         with mixed_precision(training):
-            prediction = network(
-                images.contiguous(memory_format=torch.channels_last), training_map.rays[None],
-                sources,
-            )  # fmt: skip
+            prediction = network(images, training_map.rays[None], sources)
         degrees.append(rotation_error_deg(prediction.rotation, part.rotation))
         lengths.append((prediction.position - part.position).norm(dim=-1))
     network.train(training)

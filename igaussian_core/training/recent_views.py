@@ -30,9 +30,8 @@ class RecentViews:
     @torch.no_grad()
     def add(self, keys: Tensor, views: Views) -> None:
         """Views that were trained on just now: raw keys [B, D] and poses."""
-        poses = torch.cat([views.rotation.flatten(1), views.position], 1)
         self._keys = torch.cat([self._keys.reshape(-1, keys.shape[1]), keys.detach()])[-_MOST:]
-        self._poses = torch.cat([self._poses, poses])[-_MOST:]
+        self._poses = torch.cat([self._poses, views.poses])[-_MOST:]
         self._new += len(keys)
         if len(self._keys) >= _LEAST and self._new >= _REFIT_EVERY:
             self._new = 0

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from igaussian_core.coarse.attention import PoseNetwork
@@ -103,8 +104,8 @@ class Trainer(ABC):
         """Leaves the gradients of a share in `network`; its loss, and what `_learned` wants."""
 
     @abstractmethod
-    def _validate(self) -> dict[str, float]:
-        """Figures of the network as it is, for the curve."""
+    def _errors(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Degrees [N] and lengths [N] on views held out, of the network as it is."""
 
     def _renew(self) -> None:  # noqa: B027 - not every training has something to renew
         """Called beside every step, which it must not disturb."""
@@ -130,8 +131,7 @@ class Trainer(ABC):
                 loss = self._learn(shares, workers)
                 self.step += 1
                 if self.step % plan.validate_every == 0 or self.step == plan.steps:
-                    rate = float(self._schedule.get_last_lr()[0])
-                    self.curve.add(self.step, loss=loss, **self._validate(), learning_rate=rate)
+                    self._note(loss)
                 if self._checkpoint is not None and self.step % self.save_every == 0:
                     self._save(self._checkpoint)
                 progress("training", self.step, plan.steps)
@@ -140,6 +140,14 @@ class Trainer(ABC):
         if self._checkpoint is not None:
             self._checkpoint.unlink(missing_ok=True)
         return self.curve
+
+    def _note(self, loss: float) -> None:
+        degrees, lengths = self._errors()
+        self.curve.add(
+            self.step, loss=loss, degrees=float(np.median(degrees)),
+            lengths=float(np.median(lengths)), within_15=float((degrees < 15).mean()),
+            learning_rate=float(self._schedule.get_last_lr()[0]),
+        )  # fmt: skip
 
     def _learn(self, shares: Sequence[Any], workers: ThreadPoolExecutor) -> float:
         """One step of the optimiser; the mean loss."""
