@@ -17,7 +17,7 @@ from igaussian_core.coarse.network import MapNetwork, NetworkLocalizer
 from igaussian_core.config import Config
 from igaussian_core.errors import CameraError, MapError
 from igaussian_core.features import Matcher, make_matcher
-from igaussian_core.geometry import Sim3, is_rigid, pose_error
+from igaussian_core.geometry import Sim3, compose, is_rigid, nearest_rotation, pose_error
 from igaussian_core.hypothesis import Hypothesis
 from igaussian_core.map_package import Manifest, MapPackage, open_package
 from igaussian_core.query import Query
@@ -215,7 +215,9 @@ class Localizer:
         status, reason = judge(evidence, self._config.verify)
         T_map_cam = covariance = None
         if status.ok and refinement.T_scene_cam is not None:
-            T_map_cam = self._T_map_scene.camera(refinement.T_scene_cam)
+            T = self._T_map_scene.camera(refinement.T_scene_cam)
+            # rounding would double from each tracked frame to the next
+            T_map_cam = compose(nearest_rotation(T[:3, :3]), T[:3, 3])
             scale = self._package.manifest.covariance_scale
             covariance = _covariance_in_map(refinement, self._T_map_scene, scale)
         return LocalizationResult(

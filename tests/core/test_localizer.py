@@ -105,6 +105,16 @@ def test_a_prior_is_tried_first(localizer: Localizer, room_map: GaussianMap) -> 
         assert "coarse" not in result.timings_ms  # the landmarks were not asked
 
 
+def test_rounding_does_not_grow_from_prior_to_prior(
+    localizer: Localizer, room_map: GaussianMap
+) -> None:
+    rough = QUERIES[0].copy()
+    rough[:3, :3] *= 1 + 2e-5  # as a pose of single precision may be
+    result = localizer.localize(room.photo(room_map, QUERIES[0]), room.CAMERA, rough)
+    assert_right(result, QUERIES[0])
+    assert result.source == "prior" and is_rigid(result.T_map_cam, 1e-12)  # type: ignore[arg-type]
+
+
 def test_the_prior_itself_is_never_the_answer(localizer: Localizer, room_map: GaussianMap) -> None:
     prior = QUERIES[0] @ NUDGE
     for image in (room.photo(room_map, QUERIES[0]), noise_image()):
