@@ -109,6 +109,13 @@ class Camera:
             max(1, round(self.width * scale)), max(1, round(self.height * scale))
         )
 
+    def shrunk(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """An image [H, W, 3] of a larger camera in this one's size, by averaging pixels."""
+        if image.shape[:2] == (self.height, self.width):
+            return image
+        size = (self.width, self.height)
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
     def undistorted(self) -> Camera:
         """The pinhole camera of the undistorted image: same size, only valid pixels inside.
 

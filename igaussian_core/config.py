@@ -80,7 +80,7 @@ class CoarseConfig:
         choices=("memory", "attention"),
     )
     network_hypotheses: int = _option(
-        2, "hypotheses of the pose network handed to stage two", 1, 16
+        4, "hypotheses of the pose network handed to stage two", 1, 16
     )
 
 
@@ -113,6 +113,10 @@ class RefineConfig:
     max_sampson_px: float = _option(
         1.0, "inlier threshold of the essential matrix, Sampson error in pixels", 0.1, 32
     )
+    approach_side: int = _option(
+        160, "longer side in pixels of the small images on which a hypothesis is brought near",
+        32, 8192,
+    )  # fmt: skip
     align_points: int = _option(
         400, "points of a render that are followed into the image", 16, 4096
     )

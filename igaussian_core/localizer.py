@@ -148,10 +148,7 @@ class Localizer:
         """The frame without distortion, no larger than configured."""
         camera.check_image(image)
         small = camera.scaled_to_fit(self._config.image.max_side)
-        if small != camera:
-            size = (small.width, small.height)
-            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        return small.undistort(image)
+        return small.undistort(small.shrunk(image))
 
     def _hypotheses(self, query: Query, prior: ArrayLike | None) -> Iterator[Hypothesis]:
         """Stage one: the prior, then what the network says, then places that the landmarks know;
@@ -159,15 +156,14 @@ class Localizer:
 
         In the cascade the network's places are only aligned at first: where that does not
         convince, the landmarks cost less than matching descriptors at a wrong place. They come
-        again, with descriptors, where the landmarks know none. Those of a network too rough for
-        alignment come only then.
+        again, with descriptors, where the landmarks know none.
         """
         if prior is not None:
             if not is_rigid(prior):
                 raise CameraError("prior: expected a rigid 4x4 transform T_map_cam")
             yield Hypothesis(self._T_map_scene.inverse().camera(prior), 0.0, "prior")
         method, network, asked = self._config.coarse.method, self._network, []
-        if network is not None and (method == "network" or not network.rough):
+        if network is not None:
             said = network.hypotheses(query.image, query.camera)
             for hypothesis in _timed_each(query, said):
                 asked.append(hypothesis)
@@ -176,9 +172,8 @@ class Localizer:
             yield from _timed_each(
                 query, self._landmarks.hypotheses(query.features, query.camera)
             )
-        if method == "cascade" and network is not None:
-            said = iter(asked) if asked else network.hypotheses(query.image, query.camera)
-            yield from _timed_each(query, said)
+        if method == "cascade":
+            yield from asked
 
     def _refine(
         self, query: Query, hypothesis: Hypothesis, prior: ArrayLike | None

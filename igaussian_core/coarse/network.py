@@ -32,7 +32,6 @@ FORMAT = "igaussian-pose-network-1"
 _WEIGHT = "network."
 _VIEWS = "views."
 _MEMORY = "memory."
-_ALIGNABLE_DEG = 4.0  # following points finds poses about so far away
 # hypotheses nearer than that to one before them are left out
 _SAME_DEG, _SAME_LENGTHS = 5.0, 0.1
 
@@ -109,11 +108,6 @@ class NetworkLocalizer:
         if self._memory is not None:  # widened once, not for every frame
             self._memory = self._memory._replace(keys=self._memory.keys.float())
         self._rays = cell_rays(trained.camera)[None]
-
-    @property
-    def rough(self) -> bool:
-        """Whether its poses are rarely near enough to be aligned, by its own report."""
-        return float(self._trained.report.get("median_deg", 0.0)) > _ALIGNABLE_DEG
 
     def hypotheses(self, image: Image, camera: Camera) -> Iterator[Hypothesis]:
         """The best guess first, then others that say something else.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -42,8 +41,7 @@ class CoarseOnly:
         """As Localizer.localize; the prior is not used."""
         timer = StageTimer()
         small = camera.scaled_to_fit(self._config.image.max_side)
-        resized = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
-        image, camera = small.undistort(np.asarray(resized, np.uint8))
+        image, camera = small.undistort(small.shrunk(image))
         hypothesis = self._first(image, camera, timer)
         if hypothesis is None:
             return LocalizationResult(

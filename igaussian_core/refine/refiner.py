@@ -38,6 +38,9 @@ _MAX_COMPARED_MOVE_PX = 3.0  # of a render that still shows what the image does
 _SOFT_PX = 1.0  # sigma that rids brightness of noise and of what the map shows sharper or softer
 _MAX_LOST_INLIERS = 0.05  # share of the matches' inliers that photometric alignment may lose
 _MAX_WORSE_PX = 0.1  # and by how much their median error may grow
+# following points on images made small, where they may lie far from where they are looked for
+_APPROACH_POINTS, _APPROACH_WINDOW, _APPROACH_LEVELS, _APPROACH_ROUNDS = 150, 11, 3, 3
+_MIN_APPROACHED = 12  # points that must agree
 
 
 @dataclass(frozen=True)
@@ -120,12 +123,12 @@ class Refiner:
         """The pose near a hypothesis, by alignment where that convinces, else by descriptors.
 
         Alignment costs a fifth of descriptor matching and is the more exact of the two, but
-        only finds poses a few degrees away. A pose that has the matches for it is then polished,
-        and image and render are compared there.
+        only finds poses a few degrees away; an approach on small images comes before. A pose
+        that has the matches for it is then polished, and image and render are compared there.
 
         Args:
-            near: the hypothesis comes from the last frame; descriptors are compared only near
-                where the render says the points should be.
+            near: the hypothesis comes from the last frame: it is aligned at once, and
+                descriptors are compared only near where the render says the points should be.
             prior: T_scene_cam where the camera was expected, whatever the hypothesis is.
             describe: match descriptors where alignment does not convince.
         """
@@ -137,7 +140,10 @@ class Refiner:
     def _found(
         self, query: Query, T_scene_cam: Array, near: bool, describe: bool
     ) -> Refinement:
-        aligned = self.align(query, T_scene_cam)
+        aligned = Refinement(None, None, Evidence("align"))
+        start = T_scene_cam if near else self.approach(query, T_scene_cam)
+        if start is not None:
+            aligned = self.align(query, start)
         if self._status(aligned) is Status.OK or not describe:
             return aligned
         matched = self.match(query, T_scene_cam, near)
@@ -145,6 +151,30 @@ class Refiner:
             return matched
         polished = self.align(query, matched.T_scene_cam)
         return polished if self._status(polished) is Status.OK else matched
+
+    def approach(self, query: Query, T_scene_cam: Array) -> Array | None:
+        """A hypothesis moved to where alignment finds on, by following points on small images;
+        None where they do not agree."""
+        small = query.camera.scaled_to_fit(self._config.approach_side)
+        if self._config.solver != "pnp" or small == query.camera:
+            return T_scene_cam
+        with query.timer("approach"):
+            gray = query.once("small", lambda: normalize_contrast(small.shrunk(query.image)))
+            for _ in range(_APPROACH_ROUNDS):
+                view = self._seen(small, T_scene_cam)
+                uv_render = corners(view.gray, view.trusted, _APPROACH_POINTS)
+                uv_image, good = follow(
+                    view.gray, gray, uv_render, uv_render, _APPROACH_WINDOW, _APPROACH_LEVELS
+                )
+                uv_render, uv_image = uv_render[good], uv_image[good]
+                points = _lifted(view, small, T_scene_cam, uv_render)
+                solution = solve_pnp(
+                    small, uv_image, points, self._config.max_reprojection_px, T_scene_cam
+                )
+                if solution is None or solution.inliers.sum() < _MIN_APPROACHED:
+                    return None
+                T_scene_cam = solution.T_scene_cam
+        return T_scene_cam
 
     def align(self, query: Query, T_scene_cam: Array) -> Refinement:
         """Follow points of the render into the image, PnP, again from there until it rests."""
@@ -277,19 +307,22 @@ class Refiner:
 
     def _view(self, query: Query, T_scene_cam: Array) -> _View:
         with query.timer("render"):
-            config = self._config
-            rgb, depth, alpha = self._render(query.camera, T_scene_cam)
-            covered = alpha >= config.min_alpha
-            image = to_u8(rgb)
-            return _View(
-                image=image,
-                gray=normalize_contrast(image),
-                depth=depth,
-                covered=covered,
-                trusted=trusted_depth(depth, alpha, config.min_alpha, config.max_depth_step),
-                coverage=float(covered.mean()),
-                median_depth=float(np.median(depth[covered])) if covered.any() else 0.0,
-            )
+            return self._seen(query.camera, T_scene_cam)
+
+    def _seen(self, camera: Camera, T_scene_cam: Array) -> _View:
+        config = self._config
+        rgb, depth, alpha = self._render(camera, T_scene_cam)
+        covered = alpha >= config.min_alpha
+        image = to_u8(rgb)
+        return _View(
+            image=image,
+            gray=normalize_contrast(image),
+            depth=depth,
+            covered=covered,
+            trusted=trusted_depth(depth, alpha, config.min_alpha, config.max_depth_step),
+            coverage=float(covered.mean()),
+            median_depth=float(np.median(depth[covered])) if covered.any() else 0.0,
+        )
 
     def _solve(
         self, query: Query, view: _View, T_scene_cam: Array, method: str,
@@ -297,9 +330,9 @@ class Refiner:
     ) -> Refinement:  # fmt: skip
         """The pose that the image's and the render's pixels tell, and what speaks for it."""
         camera, config = query.camera, self._config
-        depth = sample(view.depth, uv_render)
-        points = transform_points(T_scene_cam, unproject(camera, uv_render, depth))
+        points = _lifted(view, camera, T_scene_cam, uv_render)
         if self._scale is not None:
+            depth = sample(view.depth, uv_render)
             pair = ImagePair(camera, query.image, view.image, view.depth, view.covered)
             solution = solve_relative(
                 camera, uv_render, uv_image, depth, T_scene_cam, config.max_sampson_px,
@@ -335,6 +368,12 @@ class Refiner:
 def to_u8(rgb: Image) -> NDArray[np.uint8]:
     """uint8 image of a render in [0, 1]."""
     return np.asarray(cv2.convertScaleAbs(rgb, alpha=255), np.uint8)  # rounds and saturates
+
+
+def _lifted(view: _View, camera: Camera, T_scene_cam: Array, uv_render: Pixels) -> Array:
+    """Scene points [N, 3] that a render from T_scene_cam shows at pixels."""
+    depth = sample(view.depth, uv_render)
+    return transform_points(T_scene_cam, unproject(camera, uv_render, depth))
 
 
 def _soft(gray: Gray) -> Image:

@@ -156,7 +156,7 @@ class EpisodeTrainer(Trainer):
         total = len(of.nearest)
         count = min(self._options.views, total)
         near = int(count * self._rng.uniform(*_NEAR))
-        around = of.nearest[self._rng.integers(total)][: _AMONG * near].numpy()
+        around = of.nearest[self._rng.integers(total)][: int(_AMONG * near)].numpy()
         first = self._rng.choice(around, near, replace=False)
         rest = self._rng.choice(np.setdiff1d(np.arange(total), first), count - near, replace=False)
         return Episode(of, of.views.at(np.concatenate([first, rest])), near)

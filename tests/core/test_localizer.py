@@ -30,7 +30,9 @@ from igaussian_core.geometry import (
 )
 from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import open_package, with_T_map_scene
+from igaussian_core.query import Query
 from igaussian_core.result import LocalizationResult, Status
+from igaussian_core.timing import StageTimer
 
 QUERIES = room.query_poses(6)
 # two degrees and three centimetres from the truth
@@ -113,6 +115,21 @@ def test_rounding_does_not_grow_from_prior_to_prior(
     result = localizer.localize(room.photo(room_map, QUERIES[0]), room.CAMERA, rough)
     assert_right(result, QUERIES[0])
     assert result.source == "prior" and is_rigid(result.T_map_cam, 1e-12)  # type: ignore[arg-type]
+
+
+def test_a_place_too_far_off_to_align_to_is_approached(
+    localizer: Localizer, room_map: GaussianMap
+) -> None:
+    refiner = localizer._refiner
+    far = compose(rotation_from_vector([0.1, -0.2, 0.1]), [0.06, 0.05, -0.04])
+    for T in QUERIES[:4]:
+        query = Query(room.photo(room_map, T), room.CAMERA, localizer._matcher, 1, StageTimer())
+        nearer = refiner.approach(query, T @ far)
+        assert nearer is not None
+        angle, distance = pose_error(nearer, T)
+        assert angle < 0.5 and distance < 0.02
+        assert refiner.approach(query, T @ compose(rotation_from_vector([0, np.pi, 0]), [0, 0, 0])) \
+            is None  # fmt: skip
 
 
 def test_the_prior_itself_is_never_the_answer(localizer: Localizer, room_map: GaussianMap) -> None:
