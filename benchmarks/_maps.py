@@ -37,12 +37,12 @@ def compiled(work: Path, name: str) -> MapPackage:
     return open_package(compiled_path(work, name))
 
 
-def network_file(name: str, steps: int, work: Path = STAGE_ONE) -> Path:
-    """Where stage_one.py keeps the network that it trained on a map in so many steps."""
-    return work / f"{name.replace(' ', '_')}-{steps}.safetensors"
+def network_file(name: str, trained_for: str, work: Path = STAGE_ONE) -> Path:
+    """Where stage_one.py keeps a network that it trained on a map, for "memory" or "heads"."""
+    return work / f"{name.replace(' ', '_')}-{trained_for}.safetensors"
 
 
-def trained_network(name: str, steps: int) -> NetworkData | None:
+def trained_network(name: str, trained_for: str) -> NetworkData | None:
     """That network; None where it was not trained yet."""
-    file = network_file(name, steps)
+    file = network_file(name, trained_for)
     return read_tensors(file) if file.is_file() else None

@@ -61,7 +61,6 @@ from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import MapPackage
 from igaussian_core.posed_images import PosedImage
 from igaussian_core.sphere import sphere_of
-from igaussian_core.training.map_network import FROM_WEIGHTS
 from igaussian_core.view_planning import SourceView
 from igaussian_core.views import spherical_views
 
@@ -113,9 +112,9 @@ HEADS = Config.from_flat(_HEADS)
 SIFT = dataclasses.replace(CONFIG, features=dataclasses.replace(CONFIG.features, matcher="sift"))
 
 
-def _with_network(case: Case) -> MapPackage:
+def _with_network(case: Case, trained_for: str) -> MapPackage:
     """The case's map with the network that stage_one.py trained on it."""
-    network = trained_network(case.map, FROM_WEIGHTS.steps)
+    network = trained_network(case.map, trained_for)
     if network is None:
         raise NotBuilt("a pose network trained on the map: python benchmarks/stage_one.py")
     return dataclasses.replace(case.package, network=network)
@@ -126,12 +125,12 @@ def _paper(**refine: Any) -> Callable[[Case], Estimator]:
     weights, so XFeat finds the matches."""
     settings = {f"refine.{k}": v for k, v in {"rounds": 1, **refine}.items()}
     config = Config.from_flat({**_HEADS, **settings})
-    return lambda c: Staged(_with_network(c), config, lambda r, q, T: r.match(q, T))
+    return lambda c: Staged(_with_network(c, "heads"), config, lambda r, q, T: r.match(q, T))
 
 
 OURS = Method("ours", lambda c: Localizer(c.package, CONFIG))
 CASCADE = Method(
-    "ours, the map with a trained network", lambda c: Localizer(_with_network(c), CONFIG)
+    "ours, the map with a trained network", lambda c: Localizer(_with_network(c, "memory"), CONFIG)
 )
 PAPER = Method("paper: network + XFeat + RANSAC + ViT", _paper(solver="paper", scale="vit"))
 SFM = Method("SfM, SIFT (pycolmap), PnP", lambda c: SfmSift(c.package, c.references(), CONFIG))
@@ -169,14 +168,15 @@ def _staged(refine: Callable[..., Any], **settings: Any) -> Callable[[Case], Est
 
 
 ABLATION = (
-    Method("paper: network + WPM (stage one)", lambda c: CoarseOnly(_with_network(c), HEADS)),
+    Method("paper: network + WPM (stage one)",
+           lambda c: CoarseOnly(_with_network(c, "heads"), HEADS)),
     Method("paper: + XFeat, RANSAC, scale by depth", _paper(solver="paper", scale="depth")),
     Method("paper: + XFeat, RANSAC, scale by ViT", _paper(solver="paper", scale="vit")),
     Method("paper's stage one + XFeat, PnP in place of RANSAC and ViT", _paper()),
     PAPERS_SOLVER,
     PAPERS_SOLVER_VIT,
     Method("ours: network with memory (stage one)",
-           lambda c: CoarseOnly(_with_network(c), CONFIG)),
+           lambda c: CoarseOnly(_with_network(c, "memory"), CONFIG)),
     Method("ours: landmarks alone (stage one)", lambda c: CoarseOnly(c.package, CONFIG)),
     Method("ours: + matching and PnP, one round",
            _staged(lambda r, q, T: r.match(q, T), rounds=1)),

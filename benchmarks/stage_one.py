@@ -1,15 +1,15 @@
 """Stage one alone: what the pose network reaches on each map, and what each of its parts adds.
 
-    python benchmarks/stage_one.py [--json out.json] [--steps 1000] [--short-steps 300]
-                                   [--work folder] [--only maps|ablation|views]
+    python benchmarks/stage_one.py [--json out.json] [--short-steps 300] [--work folder]
+                                   [--only maps|ablation|views] [--maps lego,...] [--heads]
 
-`maps`: per map the shipped joint weights without training, the network trained on the map from
-those, and the landmarks, on the paper's protocol (300 rendered targets) and on
-held-out photos. `ablation` (the paper's table 4, stage one) and `views` (figure 5): lego, from
-random weights with --short-steps each, so that only the part in question differs. Networks
-predict by their heads ("heads": candidates and weights of the source views) and by the memory
-of views of known pose. A trained network is kept in --work, so that an interrupted benchmark
-goes on. Needs the data folder (_data.py).
+`maps`: per map the shipped joint weights without training, the network trained on the map for its
+memory from those, with --heads that trained for the paper's heads, and the landmarks, on the
+paper's protocol (300 rendered targets) and on held-out photos. `ablation` (the paper's table 4,
+stage one) and `views` (figure 5): lego, from random weights with --short-steps each, so that only
+the part in question differs. Networks predict by their heads ("heads": candidates and weights of
+the source views) and by the memory of views of known pose. A trained network is kept in --work,
+so that an interrupted benchmark goes on. Needs the data folder (_data.py).
 """
 
 from __future__ import annotations
@@ -41,10 +41,12 @@ from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.evaluate.runner import Queries, run
 from igaussian_core.map_package import MapPackage, NetworkData, read_tensors
 from igaussian_core.sphere import sphere_of
+from igaussian_core.training.episodes import EpisodeOptions
 from igaussian_core.training.map_network import (
-    FROM_WEIGHTS,
+    FOR_HEADS,
+    FOR_HEADS_FROM_WEIGHTS,
+    FOR_MEMORY,
     MEMORY,
-    OPTIONS,
     train_map_network,
 )
 from igaussian_core.training.pose_network import TrainOptions
@@ -52,6 +54,11 @@ from igaussian_core.training.pose_network import TrainOptions
 MAPS = ("lego", DEMO_ROOM, "redkitchen", "fox", "flower")
 VIEW_COUNTS = (8, 12, 16, 20)
 SHORT_MEMORY = 4000
+TRAININGS: tuple[tuple[str, str, EpisodeOptions | TrainOptions], ...] = (
+    ("joint weights, map never seen", "untrained", dataclasses.replace(FOR_MEMORY, steps=0)),
+    ("trained on the map for the memory", "memory", FOR_MEMORY),
+    ("trained on the map for the paper's heads", "heads", FOR_HEADS_FROM_WEIGHTS),
+)
 ABLATION = {
     "plain regression (one source view, nothing asked)": (PLAIN, 1),
     "concatenation with 16 source views, plain mean": (PLAIN, 16),
@@ -69,19 +76,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, help="where to write all figures")
     parser.add_argument("--work", type=Path, default=STAGE_ONE)
-    parser.add_argument("--steps", type=int, default=FROM_WEIGHTS.steps)
     parser.add_argument("--short-steps", type=int, default=300)
     parser.add_argument("--targets", type=int, default=100, help="in each of three bins")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--only", choices=("maps", "ablation", "views"))
     parser.add_argument("--maps", default=",".join(MAPS), help="of the first table")
+    parser.add_argument("--heads", action="store_true", help="train the paper's heads as well")
     options = parser.parse_args()
     options.work.mkdir(parents=True, exist_ok=True)
     tables = {"maps": maps_table, "ablation": ablation_table, "views": views_table}
     report: dict[str, Any] = {"facts": {**machine_facts(), "commit": commit()}}
     report["facts"]["training"] = (
-        f"{options.steps} steps of {OPTIONS.batch} views a map from the joint weights; ablation "
-        f"and views {options.short_steps} steps from random weights, {SHORT_MEMORY} remembered"
+        f"from the joint weights, {FOR_MEMORY.steps} steps of {FOR_MEMORY.episodes} times "
+        f"{FOR_MEMORY.views} views for the memory, {FOR_HEADS_FROM_WEIGHTS.steps} of "
+        f"{FOR_HEADS_FROM_WEIGHTS.batch} for the heads; ablation and views {options.short_steps} "
+        f"steps from random weights, {SHORT_MEMORY} remembered"
     )
     report["facts"]["queries"] = f"{options.targets} rendered targets a bin, held-out photos"
     for name, make in tables.items():
@@ -95,14 +104,12 @@ def maps_table(options: argparse.Namespace) -> list[dict[str, Any]]:
     rows = []
     for name in options.maps.split(","):
         package = compiled(options.work, name)
-        for label, steps in (
-            ("joint weights, map never seen", 0),
-            ("trained on the map, from the joint weights", options.steps),
-        ):
+        for label, file, training in TRAININGS:
+            if file == "heads" and not options.heads:
+                continue
             trained = _trained(
-                package, load_checkpoint(shipped_checkpoint()),
-                dataclasses.replace(FROM_WEIGHTS, steps=steps), 16, MEMORY,
-                network_file(name, steps, options.work), options.threads,
+                package, load_checkpoint(shipped_checkpoint()), training, 16, MEMORY,
+                network_file(name, file, options.work), options.threads,
             )  # fmt: skip
             rows += _judged(package, name, label, trained, options)
         rows += _judged(package, name, "landmarks (no training)", None, options)
@@ -130,7 +137,7 @@ def _short_trainings(
     for label, config, sources, file in parts:
         torch.manual_seed(0)
         trained = _trained(
-            package, PoseNetwork(config), dataclasses.replace(OPTIONS, steps=options.short_steps),
+            package, PoseNetwork(config), dataclasses.replace(FOR_HEADS, steps=options.short_steps),
             sources, SHORT_MEMORY,
             options.work / f"{file}-{options.short_steps}.safetensors", options.threads,
         )  # fmt: skip
@@ -139,15 +146,14 @@ def _short_trainings(
 
 
 def _trained(
-    package: MapPackage, start: PoseNetwork, options: TrainOptions, sources: int, memory: int,
-    file: Path, threads: int,
+    package: MapPackage, start: PoseNetwork, options: EpisodeOptions | TrainOptions, sources: int,
+    memory: int, file: Path, threads: int,
 ) -> NetworkData:  # fmt: skip
     """A network trained on a map; from `file` where it is there."""
     if not file.is_file():
         began = time.perf_counter()
         trained, _ = train_map_network(
-            package, start, options, sources=sources, bank=6000 if options.steps else 8,
-            memory=memory, threads=threads,
+            package, start, options, sources=sources, memory=memory, threads=threads,
         )  # fmt: skip
         data = trained.data()
         facts = {"seconds": str(time.perf_counter() - began), "steps": str(options.steps)}
@@ -161,7 +167,8 @@ def _judged(
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Rows of a network's heads and of its memory, or one of the landmarks."""
     rows = []
-    for head in ("attention", "memory") if network else ("",):
+    trained = network is not None and _report(network).get("heads")
+    for head in ("attention", "memory") if trained else ("memory",) if network else ("",):
         config = Config.from_flat(
             {"coarse.method": "network", "coarse.network_head": head} if network
             else {"coarse.method": "landmarks"}
@@ -179,6 +186,11 @@ def _judged(
         )  # fmt: skip
         rows.append(row)
     return rows
+
+
+def _report(network: NetworkData) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads(network.meta["network"])["report"]
+    return report
 
 
 def _figures(estimator: CoarseOnly, queries: Queries) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -34,13 +34,21 @@ AttentionOption = Annotated[
 def train_map(
     map_path: Annotated[Path, typer.Argument(help="compiled map directory (.igmap)")],
     steps: StepsOption = None,
+    head: Annotated[
+        str | None,
+        typer.Option(help="what is trained; memory: what the map's views of known pose tell; "
+                     "attention: the paper's candidates and weights, and the memory behind them; "
+                     "default: memory, or attention where --attention is given"),
+    ] = None,
     start: Annotated[
         str | None,
         typer.Option(help="joint: the shipped weights; random; a checkpoint file; default: joint, "
                      "or random where --attention is given"),
     ] = None,
     sources: Annotated[int, typer.Option(help="source views", min=1, max=64)] = 16,
-    bank: Annotated[int, typer.Option(help="rendered views kept at a time", min=32)] = 6000,
+    bank: Annotated[
+        int | None, typer.Option(help="rendered views to train on, kept at a time", min=32)
+    ] = None,
     memory: Annotated[
         int | None, typer.Option(help="views of known pose kept to predict by; 0: none", min=0)
     ] = None,
@@ -56,11 +64,11 @@ def train_map(
     An interrupted training goes on where it was when the same command is given again.
     """
     from igaussian_core.map_package import open_package, with_network
-    from igaussian_core.training.map_network import FROM_WEIGHTS, OPTIONS, train_map_network
+    from igaussian_core.training.map_network import train_map_network
 
     package = open_package(map_path)
     start = start or ("random" if attention else "joint")
-    options = _options(OPTIONS if start == "random" else FROM_WEIGHTS, steps, seed)
+    options = _options(_of_head(head, attention, start), steps, seed)
     threads = load_config(config, set_).runtime.threads
     with progress_bars() as progress:
         trained, curve = train_map_network(
@@ -141,6 +149,18 @@ def network_summary(report: dict[str, Any]) -> str:
         f"{report['within_15_deg']:.1%} within 15 degrees, on {report['held_out_views']} views "
         "that it was not trained on"
     )
+
+
+def _of_head(head: str | None, attention: str | None, start: str) -> Any:
+    from igaussian_core.training import map_network
+
+    if head not in (None, "memory", "attention"):
+        raise ConfigError(f"--head {head}: neither memory nor attention")
+    if head == "memory" and attention is not None:
+        raise ConfigError(f"--attention {attention}: of --head attention")
+    if head != "attention" and attention is None:
+        return map_network.FOR_MEMORY
+    return map_network.FOR_HEADS if start == "random" else map_network.FOR_HEADS_FROM_WEIGHTS
 
 
 def _options(options: Any, steps: int | None, seed: int) -> Any:

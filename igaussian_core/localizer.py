@@ -271,6 +271,11 @@ def network_of(package: MapPackage, config: Config) -> NetworkLocalizer | None:
             )
         return None
     trained = MapNetwork.from_data(package.network, f"map '{name}'")
+    if config.coarse.network_head == "attention" and not trained.report.get("heads", True):
+        raise MapError(
+            f"the map '{name}' has no trained heads, which coarse.network_head=attention needs: "
+            "'igaussian train map --head attention' trains them"
+        )
     return NetworkLocalizer(
         trained, config.coarse.network_hypotheses, config.coarse.network_head
     )

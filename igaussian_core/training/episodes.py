@@ -1,8 +1,9 @@
-"""Training over many maps so that the memory (`coarse/memory.py`) works on maps never seen.
+"""Training for the memory (`coarse/memory.py`): over many maps, so that it works on maps never
+seen, or on one.
 
-No head is trained, since what it would learn of one map means nothing in another. Each share of a
-step is an episode, as in few-shot learning: some views of one map, a part of them near one another,
-and of each it is asked what pose the memory's regression would tell from all the others. That
+The heads are not trained. Each share of a step is an episode, as in few-shot learning: some views
+of one map, a part of them near one another, and of each it is asked what pose the memory's
+regression would tell from all the others. That
 leave-one-out prediction has a closed form (Rasmussen and Williams 2006, equation 5.12)
 
     y_i - [K^-1 y]_i / [K^-1]_ii
@@ -26,7 +27,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from igaussian_core.coarse.attention import PoseNetwork
-from igaussian_core.coarse.memory import matern, raw_keys
+from igaussian_core.coarse.memory import fit_regression, matern, raw_keys
 from igaussian_core.training.augment import augmented, unchanged
 from igaussian_core.training.bank import Views
 from igaussian_core.training.pose_network import pose_errors
@@ -39,6 +40,7 @@ _HALF_LOST = 5.0  # degrees at which an error counts half as steeply as at zero
 _SAME_PLACE = 0.08  # lengths
 _CELLS = 640  # compared in an episode
 _SHARPNESS = 1 / 0.07
+_KNOWN = 2000  # views of one map that its curve is told by
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class EpisodeOptions:
     Attributes:
         steps: of the optimiser.
         views: of an episode.
-        maps: a step, an episode of each.
+        episodes: a step, each of another map where there are as many.
         learning_rate: peak of one cycle.
         places: weight of the comparison of cells.
         clip: longest gradient.
@@ -58,7 +60,7 @@ class EpisodeOptions:
 
     steps: int = 1500
     views: int = 48
-    maps: int = 2
+    episodes: int = 2
     learning_rate: float = 1.5e-3
     places: float = 0.1
     clip: float = 1.0
@@ -73,13 +75,19 @@ class EpisodeMap(NamedTuple):
         views: rendered.
         background: [3] float32 in [0, 1].
         lambda_t: degrees that a unit of length counts.
-        nearest: int64 [N, N], of each view all views, the most alike poses first.
     """
 
     views: Views
     background: Tensor
     lambda_t: float
-    nearest: Tensor
+
+    def nearest(self, index: int) -> NDArray[np.int64]:
+        """All views [N], those first whose poses are the most like that of one of them."""
+        views = self.views
+        turns = (views.rotation - views.rotation[index]).flatten(1).norm(dim=1)
+        angles = 2 * torch.arcsin((turns / 8**0.5).clamp(max=1))
+        away = (views.position - views.position[index]).norm(dim=1)
+        return (torch.rad2deg(angles) + self.lambda_t * away).argsort().numpy()
 
 
 class Episode(NamedTuple):
@@ -88,14 +96,6 @@ class Episode(NamedTuple):
     of: EpisodeMap
     views: Views
     near: int
-
-
-def episode_map(views: Views, background: Tensor, lambda_t: float) -> EpisodeMap:
-    """With the order of its views by their distances."""
-    turns = views.rotation.flatten(1)
-    angles = 2 * torch.arcsin((torch.cdist(turns, turns) / 8**0.5).clamp(max=1))
-    apart = torch.rad2deg(angles) + lambda_t * torch.cdist(views.position, views.position)
-    return EpisodeMap(views, background, lambda_t, apart.argsort(1))
 
 
 def leave_one_out(keys: Tensor, poses: Tensor) -> Tensor:
@@ -145,18 +145,19 @@ class EpisodeTrainer(Trainer):
         self, network: PoseNetwork, maps: Sequence[EpisodeMap], held_out: Sequence[EpisodeMap],
         options: EpisodeOptions, checkpoint: Path | None = None, threads: int = 2,
     ) -> None:  # fmt: skip
-        super().__init__(network, options, min(options.maps, len(maps)), checkpoint, threads)
+        super().__init__(network, options, options.episodes, checkpoint, threads)
         self._maps, self._held_out, self._options = maps, held_out, options
 
     def _draw(self) -> list[Episode]:
-        chosen = self._rng.choice(len(self._maps), len(self._copies), replace=False)
+        maps, episodes = len(self._maps), len(self._copies)
+        chosen = self._rng.choice(maps, episodes, replace=maps < episodes)
         return [self._episode(self._maps[index]) for index in chosen]
 
     def _episode(self, of: EpisodeMap) -> Episode:
-        total = len(of.nearest)
+        total = len(of.views.rgba)
         count = min(self._options.views, total)
         near = int(count * self._rng.uniform(*_NEAR))
-        around = of.nearest[self._rng.integers(total)][: int(_AMONG * near)].numpy()
+        around = of.nearest(int(self._rng.integers(total)))[: _AMONG * near]
         first = self._rng.choice(around, near, replace=False)
         rest = self._rng.choice(np.setdiff1d(np.arange(total), first), count - near, replace=False)
         return Episode(of, of.views.at(np.concatenate([first, rest])), near)
@@ -186,13 +187,45 @@ class EpisodeTrainer(Trainer):
         return degrees, lengths
 
 
+class MemoryTrainer(EpisodeTrainer):
+    """Trains a network's backbone on episodes of one map; the curve is of `held_out`, by the
+    first views of the map.
+
+    Args:
+        views: of the map.
+        held_out: views of it that are never trained on.
+        options, checkpoint, threads: as of `Trainer`.
+    """
+
+    def __init__(
+        self, network: PoseNetwork, views: EpisodeMap, held_out: Views, options: EpisodeOptions,
+        checkpoint: Path | None = None, threads: int = 2,
+    ) -> None:  # fmt: skip
+        asked = EpisodeMap(held_out, views.background, views.lambda_t)
+        super().__init__(network, [views], [asked], options, checkpoint, threads)
+
+    @torch.no_grad()
+    def _errors(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        (known,), (asked,) = self._maps, self._held_out
+        known = known._replace(views=known.views.at(np.arange(min(_KNOWN, len(known.views.rgba)))))
+        self.network.eval()
+        keys, queries = _keys(self.network, known), _keys(self.network, asked)
+        self.network.train()
+        width, mean, coefficients = fit_regression(keys, known.views.poses, _RIDGE)
+        poses = matern(torch.cdist(queries, keys), width) @ coefficients + mean
+        degrees, lengths = pose_errors(poses, asked.views)
+        return degrees.numpy(), lengths.numpy()
+
+
 @torch.no_grad()
-def leave_one_out_errors(
-    network: PoseNetwork, of: EpisodeMap, chunk: int = 64
-) -> tuple[Tensor, Tensor]:
+def leave_one_out_errors(network: PoseNetwork, of: EpisodeMap) -> tuple[Tensor, Tensor]:
     """Degrees [N] and lengths [N] of a map's views, each by all of the others."""
-    keys = [
+    return pose_errors(leave_one_out(_keys(network, of), of.views.poses), of.views)
+
+
+def _keys(network: PoseNetwork, of: EpisodeMap, chunk: int = 64) -> Tensor:
+    """Raw keys [N, D] of a map's views, their colours unchanged."""
+    return torch.cat([
         raw_keys(network.backbone(unchanged(rgba, of.background)))
         for rgba in of.views.rgba.split(chunk)
-    ]
-    return pose_errors(leave_one_out(torch.cat(keys), of.views.poses), of.views)
+    ])  # fmt: skip

@@ -20,7 +20,6 @@ from igaussian_core.training.episodes import (
     EpisodeMap,
     EpisodeOptions,
     EpisodeTrainer,
-    episode_map,
 )
 from igaussian_core.training.pose_network import lambda_t
 from igaussian_core.training.poses import PoseSampler
@@ -78,7 +77,7 @@ def procedural_views(seed: int, threads: int = 2, count: int = _VIEWS) -> Episod
         PoseScale((x, y, z), sampler.length), 0.0 if is_object else 0.6, threads,
     )  # fmt: skip
     views = draw_views(renderer, sampler, np.random.default_rng(seed), count)
-    return episode_map(
+    return EpisodeMap(
         views, torch.tensor(background, dtype=torch.float32), lambda_t(made.kind)
     )
 

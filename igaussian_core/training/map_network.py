@@ -21,6 +21,7 @@ from igaussian_core.map_package import MapPackage, open_package, with_network
 from igaussian_core.sphere import Sphere, sphere_of
 from igaussian_core.training.augment import augmented, composite
 from igaussian_core.training.bank import Bank, ViewRenderer, draw_views
+from igaussian_core.training.episodes import EpisodeMap, EpisodeOptions, MemoryTrainer
 from igaussian_core.training.pose_network import (
     MapTrainer,
     TrainingMap,
@@ -31,15 +32,16 @@ from igaussian_core.training.pose_network import (
     source_views,
 )
 from igaussian_core.training.poses import PoseSampler
-from igaussian_core.training.trainer import Curve
+from igaussian_core.training.trainer import Curve, Trainer
 from igaussian_core.views import spherical_views, spread_indices
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
-OPTIONS = TrainOptions(steps=2000)  # from random weights
-FROM_WEIGHTS = TrainOptions(steps=1000, learning_rate=1e-3)  # of a joint training
-BANK = 6000
+FOR_MEMORY = EpisodeOptions(steps=240, views=96, learning_rate=2e-3, validate_every=60)
+FOR_HEADS = TrainOptions(steps=2000)  # from random weights
+FOR_HEADS_FROM_WEIGHTS = TrainOptions(steps=1000, learning_rate=1e-3)  # of a joint training
+BANK = 6000  # views that heads are trained on at a time
 MEMORY = 12000
 HELD_OUT = 256
 UNTRAINED_MEMORY = 2000  # a sixth of the time, half as far off again
@@ -126,10 +128,10 @@ def training_map(
 def train_map_network(
     package: MapPackage,
     start: PoseNetwork,
-    options: TrainOptions,
+    options: EpisodeOptions | TrainOptions,
     *,
     sources: int = 16,
-    bank: int = BANK,
+    bank: int | None = None,
     memory: int | None = None,
     threads: int = 2,
     checkpoint: Path | None = None,
@@ -138,6 +140,8 @@ def train_map_network(
     """Train a network, from `start`'s weights, on views that a compiled map renders of itself.
 
     Args:
+        options: of episodes, to train for the memory, or of the heads' training.
+        bank: views to train on; None: as many as are remembered, for the heads BANK.
         memory: views whose poses are kept to predict by; 0: none, the network's heads do; None:
             MEMORY.
 
@@ -147,12 +151,20 @@ def train_map_network(
     torch.manual_seed(options.seed)
     torch.set_num_threads(threads)
     setting = setting_of(package, sources, threads)
-    data = training_map(package.manifest.name, setting, bank, options.seed, progress)
-    trainer = MapTrainer(start, data, options, checkpoint, threads)
-    curve = trainer.run(progress)
     count = MEMORY if memory is None else memory
-    views = remember(trainer.network, data, setting, count, options.seed, progress)
-    return trained_network(trainer.network, data, setting, options, views), curve
+    for_memory = isinstance(options, EpisodeOptions)
+    if bank is None:
+        bank = count if for_memory else BANK
+    data = training_map(package.manifest.name, setting, bank, options.seed, progress)
+    trainer: Trainer
+    if isinstance(options, EpisodeOptions):
+        views = EpisodeMap(data.bank.views, data.background, data.lambda_t)
+        trainer = MemoryTrainer(start, views, data.held_out, options, checkpoint, threads)
+    else:
+        trainer = MapTrainer(start, data, options, checkpoint, threads)
+    curve = trainer.run(progress)
+    remembered = remember(trainer.network, data, setting, count, options.seed, progress)
+    return trained_network(trainer.network, data, setting, options, remembered), curve
 
 
 def add_untrained_network(
@@ -175,7 +187,7 @@ def add_untrained_network(
         package.manifest.name, setting, count, seed, progress, UNTRAINED_HELD_OUT
     )
     views = remember(network, data, setting, count, seed, progress)
-    found = trained_network(network, data, setting, TrainOptions(steps=0, seed=seed), views)
+    found = trained_network(network, data, setting, EpisodeOptions(steps=0, seed=seed), views)
     with_network(path, found.data())
     return found.report
 
@@ -228,7 +240,8 @@ def remembered_errors(
 
 
 def trained_network(
-    network: PoseNetwork, data: TrainingMap, setting: Setting, options: TrainOptions,
+    network: PoseNetwork, data: TrainingMap, setting: Setting,
+    options: EpisodeOptions | TrainOptions,
     memory: ViewMemory | None = None,
 ) -> MapNetwork:  # fmt: skip
     """A network in evaluation mode with a map's source views and a report on held-out views."""
@@ -240,6 +253,7 @@ def trained_network(
     scale = setting.renderer.scale
     report = {
         "options": asdict(options),
+        "heads": isinstance(options, TrainOptions) and options.steps > 0,
         "memory": 0 if memory is None else len(memory.keys),
         "held_out_views": len(degrees),
         "median_deg": float(np.median(degrees)),

@@ -12,7 +12,9 @@ from typer.testing import CliRunner
 
 from igaussian_core.cli import app
 from igaussian_core.coarse.network import MapNetwork, load_checkpoint
+from igaussian_core.config import Config
 from igaussian_core.errors import ConfigError, MapError
+from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import open_package
 
 
@@ -109,6 +111,16 @@ def test_the_layout_of_the_cameras_as_a_picture(copied: Path, tmp_path: Path) ->
     assert "R = " in output
 
 
+def test_heads_that_are_not_trained_are_not_asked(copied: Path) -> None:
+    ask = Config.from_flat({"coarse.network_head": "attention"})
+    few = ("--steps", 1, "--bank", 32, "--sources", 2)
+    run("train", "map", copied, *few)
+    with pytest.raises(MapError, match=r"no trained heads.*--head attention"):
+        Localizer.open(copied, ask)
+    run("train", "map", copied, *few, "--head", "attention")
+    assert Localizer.open(copied, ask) is not None
+
+
 @pytest.mark.parametrize("attention", ["paper", "plain", "views"])
 def test_other_networks_can_be_trained(copied: Path, attention: str) -> None:
     run("train", "map", copied, "--steps", 1, "--bank", 32, "--sources", 2, "--attention",
@@ -121,3 +133,7 @@ def test_an_unknown_network_is_named(copied: Path) -> None:
         run("train", "map", copied, "--attention", "more")
     with pytest.raises(ConfigError, match="--attention plain: of --start random; joint has"):
         run("train", "map", copied, "--attention", "plain", "--start", "joint")
+    with pytest.raises(ConfigError, match="--attention plain: of --head attention"):
+        run("train", "map", copied, "--attention", "plain", "--head", "memory")
+    with pytest.raises(ConfigError, match="--head both: neither"):
+        run("train", "map", copied, "--head", "both")

@@ -13,6 +13,7 @@ from igaussian_core.training.episodes import (
     EpisodeMap,
     EpisodeOptions,
     EpisodeTrainer,
+    MemoryTrainer,
     leave_one_out,
     leave_one_out_errors,
     place_loss,
@@ -50,12 +51,13 @@ def test_leaving_one_out_sends_gradients_to_all_keys() -> None:
 def test_the_nearest_views_look_the_same_way(maps: list[EpisodeMap]) -> None:
     for of in maps:
         turns = of.views.rotation.double().numpy()
+        orders = [of.nearest(i) for i in range(96)]
         near, far = [
-            np.mean([rotation_angle_deg(turns[i].T @ turns[order[k]]) for i, order in
-                     enumerate(of.nearest.numpy())])
+            np.mean([rotation_angle_deg(turns[i].T @ turns[order[k]])
+                     for i, order in enumerate(orders)])
             for k in (1, -1)
         ]  # fmt: skip
-        assert (of.nearest[:, 0] == torch.arange(96)).all()
+        assert [order[0] for order in orders] == list(range(96))
         assert near < 0.5 * far
 
 
@@ -92,3 +94,15 @@ def test_episodes_teach_what_other_views_tell(maps: list[EpisodeMap]) -> None:
     assert np.mean(after) < 0.8 * np.mean(before)
     assert curve.steps == [24, 48] and np.isfinite(curve.values["loss"]).all()
     assert set(curve.values) == {"loss", "degrees", "lengths", "within_15", "learning_rate"}
+
+
+def test_a_map_teaches_what_its_own_views_tell(maps: list[EpisodeMap]) -> None:
+    torch.manual_seed(0)
+    of = maps[1]
+    known, held_out = of._replace(views=of.views.at(np.arange(80))), of.views.at(np.arange(80, 96))
+    options = EpisodeOptions(steps=24, views=32, learning_rate=2e-3, validate_every=12)
+    trainer = MemoryTrainer(PoseNetwork(NetworkConfig(width=64)), known, held_out, options)
+    curve = trainer.run()
+    losses = curve.values["loss"]
+    assert curve.steps == [12, 24] and losses[1] < losses[0]
+    assert np.isfinite(curve.values["degrees"]).all()

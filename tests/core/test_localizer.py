@@ -128,8 +128,8 @@ def test_a_place_too_far_off_to_align_to_is_approached(
         assert nearer is not None
         angle, distance = pose_error(nearer, T)
         assert angle < 0.5 and distance < 0.02
-        assert refiner.approach(query, T @ compose(rotation_from_vector([0, np.pi, 0]), [0, 0, 0])) \
-            is None  # fmt: skip
+        backwards = compose(rotation_from_vector([0, np.pi, 0]), [0, 0, 0])
+        assert refiner.approach(query, T @ backwards) is None
 
 
 def test_the_prior_itself_is_never_the_answer(localizer: Localizer, room_map: GaussianMap) -> None:
