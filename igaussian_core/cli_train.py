@@ -68,7 +68,7 @@ def train_map(
 
     package = open_package(map_path)
     start = start or ("random" if attention else "joint")
-    options = _options(_of_head(head, attention, start), steps, seed)
+    options = _options(_of_head(head, attention, start, memory), steps, seed)
     threads = load_config(config, set_).runtime.threads
     with progress_bars() as progress:
         trained, curve = train_map_network(
@@ -151,7 +151,7 @@ def network_summary(report: dict[str, Any]) -> str:
     )
 
 
-def _of_head(head: str | None, attention: str | None, start: str) -> Any:
+def _of_head(head: str | None, attention: str | None, start: str, memory: int | None) -> Any:
     from igaussian_core.training import map_network
 
     if head not in (None, "memory", "attention"):
@@ -159,6 +159,8 @@ def _of_head(head: str | None, attention: str | None, start: str) -> Any:
     if head == "memory" and attention is not None:
         raise ConfigError(f"--attention {attention}: of --head attention")
     if head != "attention" and attention is None:
+        if memory == 0:
+            raise ConfigError("--memory 0: of --head attention; there is nothing else to train for")
         return map_network.FOR_MEMORY
     return map_network.FOR_HEADS if start == "random" else map_network.FOR_HEADS_FROM_WEIGHTS
 

@@ -3,8 +3,8 @@ seen, or on one.
 
 The heads are not trained. Each share of a step is an episode, as in few-shot learning: some views
 of one map, a part of them near one another, and of each it is asked what pose the memory's
-regression would tell from all the others. That
-leave-one-out prediction has a closed form (Rasmussen and Williams 2006, equation 5.12)
+regression would tell from all the others. That leave-one-out prediction has a closed form
+(Rasmussen and Williams 2006, equation 5.12)
 
     y_i - [K^-1 y]_i / [K^-1]_ii
 

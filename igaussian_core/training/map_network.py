@@ -152,9 +152,8 @@ def train_map_network(
     torch.set_num_threads(threads)
     setting = setting_of(package, sources, threads)
     count = MEMORY if memory is None else memory
-    for_memory = isinstance(options, EpisodeOptions)
     if bank is None:
-        bank = count if for_memory else BANK
+        bank = count if isinstance(options, EpisodeOptions) else BANK
     data = training_map(package.manifest.name, setting, bank, options.seed, progress)
     trainer: Trainer
     if isinstance(options, EpisodeOptions):
@@ -241,8 +240,7 @@ def remembered_errors(
 
 def trained_network(
     network: PoseNetwork, data: TrainingMap, setting: Setting,
-    options: EpisodeOptions | TrainOptions,
-    memory: ViewMemory | None = None,
+    options: EpisodeOptions | TrainOptions, memory: ViewMemory | None = None,
 ) -> MapNetwork:  # fmt: skip
     """A network in evaluation mode with a map's source views and a report on held-out views."""
     network.eval()

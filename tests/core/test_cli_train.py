@@ -135,5 +135,7 @@ def test_an_unknown_network_is_named(copied: Path) -> None:
         run("train", "map", copied, "--attention", "plain", "--start", "joint")
     with pytest.raises(ConfigError, match="--attention plain: of --head attention"):
         run("train", "map", copied, "--attention", "plain", "--head", "memory")
+    with pytest.raises(ConfigError, match="--memory 0: of --head attention"):
+        run("train", "map", copied, "--memory", 0)
     with pytest.raises(ConfigError, match="--head both: neither"):
         run("train", "map", copied, "--head", "both")
