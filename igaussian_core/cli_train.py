@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +25,7 @@ StepsOption = Annotated[int | None, typer.Option(help="steps of the optimiser", 
 SeedOption = Annotated[int, typer.Option(help="of everything random")]
 CurvesOption = Annotated[Path | None, typer.Option(help="picture of the curves")]
 BoardOption = Annotated[Path | None, typer.Option(help="folder that TensorBoard reads")]
+DeviceOption = Annotated[str, typer.Option(help="of the network: cpu or cuda")]
 AttentionOption = Annotated[
     str | None,
     typer.Option(help="of random weights: tokens (default), views, none; paper; plain regression"),
@@ -68,7 +70,7 @@ def train_map(
 
     package = open_package(map_path)
     start = start or ("random" if attention else "joint")
-    options = _options(_of_head(head, attention, start, memory), steps, seed)
+    options = _options(_of_head(head, attention, start, memory), seed, steps=steps)
     threads = load_config(config, set_).runtime.threads
     with progress_bars() as progress:
         trained, curve = train_map_network(
@@ -90,20 +92,29 @@ def train_joint(
     curves: CurvesOption = None,
     tensorboard: BoardOption = None,
     attention: AttentionOption = None,
-    threads: Annotated[int, typer.Option(help="of network and renderer", min=1)] = 2,
+    threads: Annotated[
+        int, typer.Option(help="that render maps; on a CPU of the network too", min=1)
+    ] = 2,
+    views: Annotated[int | None, typer.Option(help="of an episode", min=8)] = None,
+    episodes: Annotated[int | None, typer.Option(help="a step", min=1)] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="highest learning rate", min=1e-9)
+    ] = None,
+    device: DeviceOption = "cpu",
 ) -> None:
     """Train one network on many procedural maps: what `train map` starts from."""
     from igaussian_core.coarse.network import save_checkpoint
     from igaussian_core.training.joint import OPTIONS, train_jointly
 
-    options = _options(OPTIONS, steps, seed)
+    given = {"steps": steps, "views": views, "episodes": episodes, "learning_rate": rate}
+    options = _options(OPTIONS, seed, **given)
     with progress_bars() as progress:
         network, curve = train_jointly(
             maps, options, _config(attention), threads,
-            output.with_name(output.name + ".training"), Stages(progress),
+            output.with_name(output.name + ".training"), Stages(progress), _device(device),
         )  # fmt: skip
     last = {name: values[-1] for name, values in curve.values.items()}
-    save_checkpoint(network, output, {"maps": maps, "steps": options.steps, **last})
+    save_checkpoint(network, output, {"maps": maps, **dataclasses.asdict(options), **last})
     _write_curve(curve, curves, tensorboard)
     console.print(f"{output}: {last}")
 
@@ -123,7 +134,10 @@ def train_scale_vit(
     minutes: Annotated[
         float | None, typer.Option(help="stop after so many; called again, it goes on", min=0)
     ] = None,
-    threads: Annotated[int, typer.Option(help="of the network", min=1)] = 2,
+    threads: Annotated[
+        int, typer.Option(help="that render views; on a CPU of the network too", min=1)
+    ] = 2,
+    device: DeviceOption = "cpu",
 ) -> None:
     """Train the scale ViT; its weights, curves and picture are written to the folder."""
     import torch
@@ -136,7 +150,7 @@ def train_scale_vit(
         maps=maps, places=places, steps=steps, batch=batch, rate=rate, every=every, seed=seed
     )
     with progress_bars() as bars:
-        errors = train(folder, options, minutes, Stages(bars))
+        errors = train(folder, options, minutes, Stages(bars), threads, _device(device))
     console.print_json(json.dumps({"weights": str(folder / "scale_vit.safetensors"), **errors}))
 
 
@@ -165,10 +179,20 @@ def _of_head(head: str | None, attention: str | None, start: str, memory: int | 
     return map_network.FOR_HEADS if start == "random" else map_network.FOR_HEADS_FROM_WEIGHTS
 
 
-def _options(options: Any, steps: int | None, seed: int) -> Any:
-    import dataclasses
+def _options(options: Any, seed: int, **given: float | None) -> Any:
+    """Options with those replaced that were given."""
+    kept = {name: value for name, value in given.items() if value is not None}
+    return dataclasses.replace(options, seed=seed, **kept)
 
-    return dataclasses.replace(options, seed=seed, steps=options.steps if steps is None else steps)
+
+def _device(name: str) -> str:
+    import torch
+
+    if name not in ("cpu", "cuda"):
+        raise ConfigError(f"--device {name}: neither cpu nor cuda")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("--device cuda: this installation of torch sees no such GPU")
+    return name
 
 
 def _start(start: str, attention: str | None) -> Any:

@@ -171,9 +171,9 @@ def solve_motion(
         weights: [B, N], of sum 1.
     """
     rays = torch.cat([places, torch.ones_like(places[:, :1])], 1).expand(len(found), -1, -1)
-    rotation = torch.eye(3).expand(len(found), 3, 3)
-    translation = torch.zeros(len(found), 3)
-    damping = 1e-4 * torch.eye(6)
+    rotation = torch.eye(3, device=found.device).expand(len(found), 3, 3)
+    translation = torch.zeros(len(found), 3, device=found.device)
+    damping = 1e-4 * torch.eye(6, device=found.device)
     for _ in range(rounds):
         turned = rays @ rotation.transpose(1, 2)
         y = turned + inverse_depth[..., None] * translation[:, None]
@@ -202,7 +202,8 @@ def rotation_matrices(rotvec: Tensor) -> Tensor:
     zero = torch.zeros_like(rotvec[:, 0])
     x, y, z = rotvec.unbind(1)
     K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).view(-1, 3, 3)
-    return torch.eye(3) + angle.sin() / angle * K + (1 - angle.cos()) / angle**2 * K @ K
+    identity = torch.eye(3, device=K.device)
+    return identity + angle.sin() / angle * K + (1 - angle.cos()) / angle**2 * K @ K
 
 
 def _split(x: Tensor, heads: int) -> Tensor:

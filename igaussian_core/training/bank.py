@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -17,7 +17,6 @@ from igaussian_core.coarse.pose_scale import PoseScale, contracted
 from igaussian_core.errors import MapError
 from igaussian_core.gaussian_map import GaussianMap
 from igaussian_core.geometry import inverse
-from igaussian_core.training.poses import PoseSampler
 
 Array = NDArray[np.float64]
 
@@ -26,6 +25,12 @@ _MIN_CONTRAST = 6.0  # grey levels: a bare ceiling tells nobody where he is
 _CHUNK = 64
 _TRIES = 60  # chunks without a usable view before a map is given up
 _WORST_YIELD = 0.02  # share of usable views below which it is given up as well
+
+
+class Sampler(Protocol):
+    """Draws T_scene_cam [count, 4, 4]; whether they show anything is not asked."""
+
+    def draw(self, rng: np.random.Generator, count: int) -> Array: ...
 
 
 class Views(NamedTuple):
@@ -52,8 +57,12 @@ class Views(NamedTuple):
 
     def at(self, index: NDArray[np.int64]) -> Views:
         """Some of them."""
-        chosen = torch.from_numpy(index)
+        chosen = torch.from_numpy(index).to(self.rgba.device)
         return Views(*(part[chosen] for part in self))
+
+    def to(self, device: torch.device) -> Views:
+        """All on a device."""
+        return Views(*(part.to(device) for part in self))
 
 
 @dataclass(frozen=True)
@@ -101,7 +110,7 @@ class ViewRenderer:
 
 def draw_views(
     renderer: ViewRenderer,
-    sampler: PoseSampler,
+    sampler: Sampler,
     rng: np.random.Generator,
     count: int,
     progress: Callable[[int, int], None] = lambda done, of: None,
@@ -140,7 +149,7 @@ class Bank:
     def __init__(
         self,
         renderer: ViewRenderer,
-        sampler: PoseSampler,
+        sampler: Sampler,
         size: int,
         seed: int,
         progress: Callable[[int, int], None] = lambda done, of: None,

@@ -84,10 +84,8 @@ class EpisodeMap(NamedTuple):
     def nearest(self, index: int) -> NDArray[np.int64]:
         """All views [N], those first whose poses are the most like that of one of them."""
         views = self.views
-        turns = (views.rotation - views.rotation[index]).flatten(1).norm(dim=1)
-        angles = 2 * torch.arcsin((turns / 8**0.5).clamp(max=1))
-        away = (views.position - views.position[index]).norm(dim=1)
-        return (torch.rad2deg(angles) + self.lambda_t * away).argsort().numpy()
+        unlike = pose_differences(views.rotation, views.position, index, self.lambda_t)
+        return np.asarray(unlike.argsort().cpu())
 
 
 class Episode(NamedTuple):
@@ -98,6 +96,15 @@ class Episode(NamedTuple):
     near: int
 
 
+def pose_differences(
+    rotation: Tensor, position: Tensor, index: int, weight_t: float
+) -> Tensor:
+    """Degrees plus `weight_t` times distance [N] of poses, [N, 3, 3] and [N, 3], from one."""
+    turns = (rotation - rotation[index]).flatten(1).norm(dim=1)
+    angles = 2 * torch.arcsin((turns / 8**0.5).clamp(max=1))
+    return torch.rad2deg(angles) + weight_t * (position - position[index]).norm(dim=1)
+
+
 def leave_one_out(keys: Tensor, poses: Tensor) -> Tensor:
     """Of N views the poses [N, 12] that a regression by the keys [N, D] of the others tells."""
     keys = keys - keys.mean(0)
@@ -105,7 +112,7 @@ def leave_one_out(keys: Tensor, poses: Tensor) -> Tensor:
     distances = (squares[:, None] + squares - 2 * keys @ keys.T).clamp(min=0).add(1e-6).sqrt()
     gram = matern(distances, distances.detach().median())
     inverse = torch.cholesky_inverse(
-        torch.linalg.cholesky(gram + _RIDGE * torch.eye(len(keys)))
+        torch.linalg.cholesky(gram + _RIDGE * torch.eye(len(keys), device=keys.device))
     )
     return poses - inverse @ (poses - poses.mean(0)) / inverse.diagonal()[:, None]
 
@@ -115,13 +122,14 @@ def place_loss(features: Tensor, views: Views, random: torch.Generator) -> Tenso
     the logarithm of their share of the resemblance to all other views' cells."""
     count, _, height, width = features.shape
     shown = torch.nonzero(views.known.flatten()).flatten()
-    chosen = shown[torch.randperm(len(shown), generator=random)[:_CELLS]]
+    device = features.device
+    chosen = shown[torch.randperm(len(shown), generator=random, device=device)[:_CELLS]]
     if len(chosen) < 2:
         return features.sum() * 0
     cells = features.permute(0, 2, 3, 1).flatten(0, 2)[chosen]
     cells = F.normalize(cells - cells.mean(0), dim=1)
     places = views.points.flatten(0, 2)[chosen]
-    view = torch.arange(count).repeat_interleave(height * width)[chosen]
+    view = torch.arange(count, device=device).repeat_interleave(height * width)[chosen]
     other = view[:, None] != view
     same = other & (torch.cdist(places, places) < _SAME_PLACE)
     seen_again = same.any(1)
@@ -135,23 +143,34 @@ def place_loss(features: Tensor, views: Views, random: torch.Generator) -> Tenso
 class EpisodeTrainer(Trainer):
     """Trains a network's backbone on episodes of many maps.
 
+    On a GPU all episodes of a step go through the network together.
+
     Args:
         maps: to train on.
         held_out: maps that the curve is measured on.
-        checkpoint, threads: as of `Trainer`.
+        checkpoint, threads, device: as of `Trainer`; the maps' views are on that device.
     """
 
     def __init__(
         self, network: PoseNetwork, maps: Sequence[EpisodeMap], held_out: Sequence[EpisodeMap],
         options: EpisodeOptions, checkpoint: Path | None = None, threads: int = 2,
+        device: str = "cpu",
     ) -> None:  # fmt: skip
-        super().__init__(network, options, options.episodes, checkpoint, threads)
-        self._maps, self._held_out, self._options = maps, held_out, options
+        shares = options.episodes if device == "cpu" else 1
+        super().__init__(network, options, shares, checkpoint, threads, device)
+        self._held_out, self._options = held_out, options
+        self._maps = maps
 
-    def _draw(self) -> list[Episode]:
-        maps, episodes = len(self._maps), len(self._copies)
-        chosen = self._rng.choice(maps, episodes, replace=maps < episodes)
-        return [self._episode(self._maps[index]) for index in chosen]
+    def _known(self) -> Sequence[EpisodeMap]:
+        """The maps to draw from at the present step."""
+        return self._maps
+
+    def _draw(self) -> list[list[Episode]]:
+        maps, episodes = self._known(), self._options.episodes
+        chosen = self._rng.choice(len(maps), episodes, replace=len(maps) < episodes)
+        drawn = [self._episode(maps[index]) for index in chosen]
+        shares = len(self._copies)
+        return [drawn[share::shares] for share in range(shares)]
 
     def _episode(self, of: EpisodeMap) -> Episode:
         total = len(of.views.rgba)
@@ -163,27 +182,33 @@ class EpisodeTrainer(Trainer):
         return Episode(of, of.views.at(np.concatenate([first, rest])), near)
 
     def _gradients(
-        self, network: PoseNetwork, random: torch.Generator, share: Episode
+        self, network: PoseNetwork, random: torch.Generator, share: list[Episode]
     ) -> tuple[float, None]:
-        of, views, near = share
-        images = augmented(views.rgba, of.background, random)
+        images = torch.cat([augmented(e.views.rgba, e.of.background, random) for e in share])
         network.zero_grad(set_to_none=True)
-        with mixed_precision():
+        with mixed_precision(images.device.type):
             features = network.backbone(images)
-        features = features.float()
+        parts = features.float().split([len(e.views.rgba) for e in share])
+        losses = [
+            self._loss(part, episode, random) for part, episode in zip(parts, share, strict=True)
+        ]
+        loss = torch.stack(losses).mean()
+        loss.backward()  # type: ignore[no-untyped-call]
+        return float(loss.detach()), None
+
+    def _loss(self, features: Tensor, episode: Episode, random: torch.Generator) -> Tensor:
+        of, views, near = episode
         degrees, lengths = pose_errors(leave_one_out(raw_keys(features), views.poses), views)
         # those that nothing near tells of are past help
         loss = torch.log1p((degrees + of.lambda_t * lengths) / _HALF_LOST).mean()
         neighbours = views.at(np.arange(near))
-        loss = loss + self._options.places * place_loss(features[:near], neighbours, random)
-        loss.backward()  # type: ignore[no-untyped-call]
-        return float(loss.detach()), None
+        return loss + self._options.places * place_loss(features[:near], neighbours, random)
 
     def _errors(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         self.network.eval()
         found = [leave_one_out_errors(self.network, of) for of in self._held_out]
         self.network.train()
-        degrees, lengths = (torch.cat(part).numpy() for part in zip(*found, strict=True))
+        degrees, lengths = (torch.cat(part).cpu().numpy() for part in zip(*found, strict=True))
         return degrees, lengths
 
 

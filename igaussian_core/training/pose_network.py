@@ -236,7 +236,7 @@ def source_views(network: PoseNetwork, training_map: TrainingMap) -> SourceViews
     views, training = training_map.sources, network.training
     images = unchanged(views.rgba, training_map.background)
     network.eval()
-    with torch.no_grad(), mixed_precision(training):
+    with torch.no_grad(), mixed_precision(enabled=training):
         features = network.backbone(images).float()
     network.train(training)
     return SourceViews(
@@ -258,7 +258,7 @@ def held_out_errors(
     for start in range(0, len(held_out.rgba), chunk):
         part = Views(*(field[start : start + chunk] for field in held_out))
         images = unchanged(part.rgba, training_map.background)
-        with mixed_precision(training):
+        with mixed_precision(enabled=training):
             prediction = network(images, training_map.rays[None], sources)
         degrees.append(rotation_error_deg(prediction.rotation, part.rotation))
         lengths.append((prediction.position - part.position).norm(dim=-1))

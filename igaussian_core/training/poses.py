@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -86,7 +87,10 @@ def _direction(rng: np.random.Generator, up: tuple[float, float, float]) -> Arra
     z = rng.uniform(-np.sin(_MAX_ELEVATION), np.sin(_MAX_ELEVATION))
     azimuth = rng.uniform(0, 2 * np.pi)
     level = np.sqrt(1 - z * z)
-    return up_rotation(up) @ np.array([level * np.cos(azimuth), level * np.sin(azimuth), z])
+    return _turned_up(up) @ np.array([level * np.cos(azimuth), level * np.sin(azimuth), z])
+
+
+_turned_up = functools.cache(up_rotation)
 
 
 def _rolled(T_scene_cam: Array, rng: np.random.Generator, sigma_deg: float) -> Array:

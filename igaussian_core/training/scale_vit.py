@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import repeat
+from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -90,16 +93,22 @@ _Shot = tuple[NDArray[np.uint8], NDArray[np.float32], Array, float]
 
 
 def render_views(
-    seeds: list[int], places: int, progress: Callable[[int, int], None] = lambda done, of: None
-) -> Views:
-    """Views of the procedural maps with these seeds."""
+    seeds: Sequence[int], places: int, threads: int = 1,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Views:  # fmt: skip
+    """Views of the procedural maps with these seeds, made by so many processes."""
     parts = []
-    for done, seed in enumerate(seeds):
-        rng = np.random.default_rng([seed, 3])
-        make = make_object if rng.random() < _OBJECT_SHARE else make_room
-        parts.append(views_of(make(seed), places, rng))
-        progress(done + 1, len(seeds))
+    with ProcessPoolExecutor(threads, get_context("spawn")) as workers:
+        for part in workers.map(_views_of_seed, seeds, repeat(places)):
+            parts.append(part)
+            progress(len(parts), len(seeds))
     return join(parts)
+
+
+def _views_of_seed(seed: int, places: int) -> Views:
+    rng = np.random.default_rng([seed, 3])
+    make = make_object if rng.random() < _OBJECT_SHARE else make_room
+    return views_of(make(seed), places, rng)
 
 
 def join(parts: list[Views]) -> Views:
@@ -202,14 +211,21 @@ class Batch:
     places: Tensor
     depths: Tensor
 
+    def to(self, device: str) -> Batch:
+        """All on a device."""
+        return Batch(*(part.to(device) for part in vars(self).values()))
 
-def batches(views: Views, batch: int, steps: range, seed: int) -> Iterator[Batch]:
+
+def batches(
+    views: Views, batch: int, steps: range, seed: int, device: str = "cpu"
+) -> Iterator[Batch]:
     """One batch a step; the same for the same step, so that a stopped run can go on."""
     for step in steps:
         rng = np.random.default_rng([seed, step])
         place = rng.integers(len(views) // VIEWS, size=batch)
         order = np.argsort(rng.random((batch, VIEWS)), axis=1)[:, :2]
-        yield changed(pairs(views, place * VIEWS + order[:, 0], place * VIEWS + order[:, 1]), rng)
+        drawn = pairs(views, place * VIEWS + order[:, 0], place * VIEWS + order[:, 1], device)
+        yield changed(drawn, rng)
 
 
 def all_pairs(views: Views, seed: int) -> Batch:
@@ -218,19 +234,23 @@ def all_pairs(views: Views, seed: int) -> Batch:
     return changed(pairs(views, index, index + 1), np.random.default_rng(seed), masks=False)
 
 
-def pairs(views: Views, a: NDArray[np.int64], b: NDArray[np.int64]) -> Batch:
+def pairs(
+    views: Views, a: NDArray[np.int64], b: NDArray[np.int64], device: str = "cpu"
+) -> Batch:
     """The views a as renders and b as photos, index by index."""
     T = inverse(views.T_scene_cam[b]) @ views.T_scene_cam[a]
     R, t = T[:, :3, :3], T[:, :3, 3]
     targets, weights, places = _correspondences(views.depths[a], views.depths[b], R, t)
-    images = [torch.from_numpy(views.images[i]).permute(0, 3, 1, 2) / 255.0 for i in (a, b)]
+    images = [
+        torch.from_numpy(views.images[i]).to(device).permute(0, 3, 1, 2) / 255.0 for i in (a, b)
+    ]
     return Batch(
         images[0], images[1], torch.from_numpy(R).float(),
         torch.from_numpy(t / views.medians[a][:, None]).float(),
         torch.from_numpy(targets), torch.from_numpy(weights).float(),
         torch.from_numpy(places).float(),
         torch.from_numpy(views.depths[a] / views.medians[a][:, None, None]).float().flatten(1),
-    )  # fmt: skip
+    ).to(device)  # fmt: skip
 
 
 def _correspondences(
@@ -266,22 +286,23 @@ def _correspondences(
 def changed(batch: Batch, rng: np.random.Generator, masks: bool = True) -> Batch:
     """The photo as a camera would have taken it: exposure, white balance, gamma, blur, noise;
     and sometimes a border about both images, as a narrower camera leaves."""
-    n = len(batch.a)
+    n, device = len(batch.a), batch.a.device
 
     def draw(low: float, high: float, channels: int = 1) -> Tensor:
         values = rng.uniform(low, high, (n, channels, 1, 1))
-        return torch.from_numpy(values).float()
+        return torch.from_numpy(values).float().to(device)
 
     b = batch.b.clamp(1e-4) ** draw(0.75, 1.33)
     b = b * draw(0.6, 1.5) * draw(0.9, 1.1, 3)
     soft = F.avg_pool2d(F.pad(b, (1, 1, 1, 1), mode="replicate"), 3, 1)
     b = torch.lerp(b, soft, draw(0, 1))
-    noise = torch.from_numpy(rng.standard_normal(b.shape, np.float32))
+    random = torch.Generator(device).manual_seed(int(rng.integers(1 << 62)))
+    noise = torch.randn(b.shape, generator=random, device=device)
     b = (b + noise * draw(0, 0.04)).clamp(0, 1)
     a = batch.a
     if masks:
-        half = torch.where(draw(0, 1) < 0.35, draw(0.6, 1.0), torch.ones(n, 1, 1, 1))
-        axis = torch.linspace(-1, 1, SIDE).abs()
+        half = torch.where(draw(0, 1) < 0.35, draw(0.6, 1.0), torch.ones_like(b[:, :1, :1, :1]))
+        axis = torch.linspace(-1, 1, SIDE, device=device).abs()
         seen = (torch.maximum(axis[:, None], axis[None]) <= half).float()
         a, b = a * seen, b * seen
     return replace(batch, a=a, b=b)
@@ -357,12 +378,16 @@ def train_scale_vit(
     options: ScaleTraining = ScaleTraining(),
     minutes: float | None = None,
     progress: Callable[[str, int, int], None] = lambda stage, done, of: None,
+    threads: int = 2,
+    device: str = "cpu",
 ) -> dict[str, float]:
     """Train, or go on training, in a folder; writes scale_vit.safetensors, curves.json and .png.
 
     Args:
         minutes: stop after so many; the next call goes on.
         progress: told the stage, how much of it is done, and of how much.
+        threads: that render views.
+        device: of the network: cpu or cuda.
 
     Returns:
         The errors of `validate` on held-out procedural maps when last looked at.
@@ -371,11 +396,12 @@ def train_scale_vit(
         WeightsError: the folder's state is of another training.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    train, held_out = _views(folder, options, progress)
-    run = _Run(folder, options, all_pairs(held_out, options.seed))
+    train, held_out = _views(folder, options, threads, progress)
+    run = _Run(folder, options, all_pairs(held_out, options.seed).to(device), device)
     run.resume()
     stop = None if minutes is None else time.monotonic() + 60 * minutes
-    for batch in batches(train, options.batch, range(run.step, options.steps), options.seed):
+    steps = range(run.step, options.steps)
+    for batch in batches(train, options.batch, steps, options.seed, device):
         run.advance(batch)
         progress("training", run.step, options.steps)
         if stop is not None and time.monotonic() > stop:
@@ -385,7 +411,8 @@ def train_scale_vit(
 
 
 def _views(
-    folder: Path, options: ScaleTraining, progress: Callable[[str, int, int], None]
+    folder: Path, options: ScaleTraining, threads: int,
+    progress: Callable[[str, int, int], None],
 ) -> tuple[Views, Views]:
     """Views for training and of held-out maps; kept in the folder, since they take minutes."""
     result = []
@@ -396,7 +423,7 @@ def _views(
         file = folder / f"views_{name}_{first}_{count}_{places}.npz"
         if not file.exists():
             tell = partial(progress, f"rendering maps ({name})")
-            views = render_views(list(range(first, first + count)), places, tell)
+            views = render_views(range(first, first + count), places, threads, tell)
             np.savez(file, **vars(views))
         with np.load(file) as data:
             result.append(Views(**{key: data[key] for key in data.files}))
@@ -406,11 +433,14 @@ def _views(
 class _Run:
     """Network, optimiser and curves of a training, and where they are kept."""
 
-    def __init__(self, folder: Path, options: ScaleTraining, held_out: Batch) -> None:
+    def __init__(
+        self, folder: Path, options: ScaleTraining, held_out: Batch, device: str
+    ) -> None:
         torch.manual_seed(options.seed)
         self.folder, self.options, self.held_out = folder, options, held_out
-        self.net = ScaleVit()
-        self.mean = ScaleVit()  # of the weights over the last steps, which is what is kept
+        self.net = ScaleVit().to(device)
+        # of the weights over the last steps, which is what is kept
+        self.mean = ScaleVit().to(device)
         self.mean.load_state_dict(self.net.state_dict())
         self.optimiser = torch.optim.AdamW(self.net.parameters(), options.rate, weight_decay=0.02)
         self.step = 0
@@ -492,7 +522,7 @@ def save_weights(
     net: ScaleVit, file: Path, errors: dict[str, float], training: dict[str, float]
 ) -> None:
     """fp16 tensors, with what they reached and how they were trained in the file's metadata."""
-    tensors = {name: value.half().contiguous() for name, value in net.state_dict().items()}
+    tensors = {name: value.half().cpu().contiguous() for name, value in net.state_dict().items()}
     about = {"errors": json.dumps(errors), "training": json.dumps(training)}
     save_file(tensors, file, metadata=about)
 

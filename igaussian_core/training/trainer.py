@@ -63,6 +63,7 @@ class Trainer(ABC):
         shares: of a step.
         checkpoint: file that an interrupted training goes on from; None: none is written.
         threads: at most so many shares at a time.
+        device: of network and shares: cpu, or cuda for a training of many maps.
 
     Raises:
         ConfigError: `checkpoint` is there, but unreadable or of other options.
@@ -70,9 +71,10 @@ class Trainer(ABC):
 
     def __init__(
         self, network: PoseNetwork, options: Options, shares: int,
-        checkpoint: Path | None = None, threads: int = 2,
+        checkpoint: Path | None = None, threads: int = 2, device: str = "cpu",
     ) -> None:  # fmt: skip
-        self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        network = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.network = network
         self.curve = Curve()
         self.save_every = 500  # steps
         self.step = 0
@@ -80,7 +82,7 @@ class Trainer(ABC):
         self._rng = np.random.default_rng(options.seed)
         self._copies = [network, *(_sharing_copy(network) for _ in range(shares - 1))]
         self._randoms = [
-            torch.Generator().manual_seed(1000 * options.seed + i) for i in range(shares)
+            torch.Generator(device).manual_seed(1000 * options.seed + i) for i in range(shares)
         ]
         self._optimizer = torch.optim.AdamW(
             network.parameters(), lr=options.learning_rate, weight_decay=0.02, fused=True
@@ -193,12 +195,11 @@ class Trainer(ABC):
         self.curve = Curve(**state["curve"])
 
 
-def mixed_precision(enabled: bool = True) -> torch.autocast:
-    """bfloat16 where the CPU computes in it. Without autocast's cache of weights, which is the
+def mixed_precision(device: str = "cpu", enabled: bool = True) -> torch.autocast:
+    """bfloat16 where the device computes in it. Without autocast's cache of weights, which is the
     process's: another thread would empty it halfway."""
-    return torch.autocast(
-        "cpu", torch.bfloat16, enabled=enabled and has_native_bfloat16(), cache_enabled=False
-    )
+    native = device != "cpu" or has_native_bfloat16()
+    return torch.autocast(device, torch.bfloat16, enabled=enabled and native, cache_enabled=False)
 
 
 def _sharing_copy(network: PoseNetwork) -> PoseNetwork:

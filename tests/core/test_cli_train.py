@@ -93,6 +93,17 @@ def test_a_map_that_shows_too_little_is_compiled_without(
     assert open_package(tmp_path / "room.igmap").network is None
 
 
+@pytest.mark.parametrize(
+    ("device", "said"), [("tpu", "--device tpu: neither cpu nor cuda"), ("cuda", "sees no such")]
+)
+def test_a_device_that_is_not_there_is_named(
+    tmp_path: Path, device: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(ConfigError, match=said):
+        run("train", "joint", "-o", tmp_path / "joint.safetensors", "--device", device)
+
+
 def test_joint_training_writes_a_checkpoint(tmp_path: Path) -> None:
     run("train", "joint", "-o", tmp_path / "joint.safetensors", "--maps", 2, "--steps", 1)
     assert load_checkpoint(tmp_path / "joint.safetensors").config.attention == "tokens"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -17,14 +19,70 @@ from igaussian_core.training.episodes import (
     leave_one_out,
     leave_one_out_errors,
     place_loss,
+    pose_differences,
 )
-from igaussian_core.training.joint import procedural_views
+from igaussian_core.training.joint import (
+    ComingMaps,
+    JointTrainer,
+    _made,
+    _Parts,
+    procedural_views,
+)
 
 
 @pytest.fixture(scope="module")
 def maps() -> list[EpisodeMap]:
     """A room and an object."""
     return [procedural_views(seed, count=96) for seed in (0, 1)]
+
+
+def test_a_map_of_a_training_never_shows_a_view_twice(maps: list[EpisodeMap]) -> None:
+    for of in maps:
+        poses = of.views.poses
+        apart = torch.cdist(poses, poses) + torch.eye(len(poses))
+        assert float(apart.min()) > 1e-6
+
+
+def test_two_thirds_of_a_map_s_views_are_near_one_another(maps: list[EpisodeMap]) -> None:
+    for of in maps:
+        views = of.views
+        anywhere, *near = [
+            float(np.median([
+                pose_differences(part.rotation, part.position, i, of.lambda_t).median()
+                for i in range(32)
+            ]))
+            for part in (views.at(np.arange(k, k + 32)) for k in (0, 32, 64))
+        ]  # fmt: skip
+        assert max(near) < 0.6 * anywhere
+
+
+def test_maps_come_in_the_order_of_their_seeds_however_soon_they_are_there() -> None:
+    late, soon = Future[_Parts](), Future[_Parts]()
+    soon.set_result(_made(1, count=9))
+    coming = ComingMaps([late, soon], "cpu")
+    assert len(coming) == 2
+    with ThreadPoolExecutor(1) as waiting:
+        asked = waiting.submit(coming.first, 1)
+        late.set_result(_made(0, count=9))
+        (first,) = asked.result(timeout=60)
+    expected = procedural_views(0, count=9)
+    assert torch.equal(first.views.rgba, expected.views.rgba)
+    assert torch.equal(first.background, expected.background)
+    assert coming.first(2)[1].lambda_t == procedural_views(1, count=9).lambda_t
+
+
+def test_all_maps_are_in_use_after_half_of_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("igaussian_core.training.joint._AT_FIRST", 2)
+    made: list[Future[_Parts]] = [Future() for _ in range(7)]
+    for seed, future in enumerate(made):
+        future.set_result(_made(seed % 2, count=9))
+    options = EpisodeOptions(steps=8, views=9)
+    network = PoseNetwork(NetworkConfig(width=64))
+    trainer = JointTrainer(network, ComingMaps(made, "cpu"), 1, options, None, 1, "cpu")
+    used = []
+    for trainer.step in range(8):
+        used.append(len(trainer._known()))
+    assert used == [2, 3, 4, 5, 6, 6, 6, 6]
 
 
 def test_leaving_one_out_is_what_a_regression_without_it_says() -> None:
