@@ -16,12 +16,14 @@ class Hypothesis:
         T_scene_cam: 4x4 float64.
         score: the larger the better; comparable among hypotheses of one source only.
         source: "prior", "landmarks", "network".
-        describe: whether stage two may match descriptors where alignment does not convince.
+        align: whether stage two aligns here; not where it did so before in vain.
+        describe: whether it may match descriptors where alignment does not convince.
         rival: another place, 4x4, that explains nearly as much of the image; None: none known.
     """
 
     T_scene_cam: NDArray[np.float64]
     score: float
     source: str
+    align: bool = True
     describe: bool = True
     rival: NDArray[np.float64] | None = None

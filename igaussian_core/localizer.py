@@ -102,22 +102,27 @@ class Localizer:
         failure = LocalizationResult(
             Status.NO_HYPOTHESIS, "no place in the map resembles the image", source="landmarks"
         )
+        budget_ms = self._config.runtime.budget_ms
         over = False
         for hypothesis in self._hypotheses(query, prior):
             if over:
-                failure = _out_of_time(failure, self._config.runtime.budget_ms)
+                failure = _out_of_time(failure, budget_ms)
                 break
-            refinement = self._refine(query, hypothesis, prior)
+            # the next frame of a track is worth more than the last place of this one
+            late = prior is not None and hypothesis.source != "prior"
+            late = late and timer.elapsed_ms() + self._refiner.match_ms > budget_ms
+            describe = hypothesis.describe and not late
+            refinement = self._refine(query, hypothesis, prior, describe)
             result = self._result(hypothesis, refinement)
             if result.ok:
-                if timer.elapsed_ms() <= self._config.runtime.budget_ms:
+                if timer.elapsed_ms() <= budget_ms:
                     result = self._unless_ambiguous(query, hypothesis, refinement, result)
                 return _timed(result, timer)
             if result.inliers >= failure.inliers:
                 failure = result
-            over = timer.elapsed_ms() > self._config.runtime.budget_ms
+            over = timer.elapsed_ms() > budget_ms or describe != hypothesis.describe
             if over and hypothesis.source != "landmarks":  # whose search would take longer still
-                failure = _out_of_time(failure, self._config.runtime.budget_ms)
+                failure = _out_of_time(failure, budget_ms)
                 break
         return _timed(failure, timer)
 
@@ -166,7 +171,7 @@ class Localizer:
         if network is not None:
             said = network.hypotheses(query.image, query.camera)
             for hypothesis in _timed_each(query, said):
-                asked.append(hypothesis)
+                asked.append(replace(hypothesis, align=False))
                 yield replace(hypothesis, describe=method == "network")
         if method != "network":
             yield from _timed_each(
@@ -176,14 +181,15 @@ class Localizer:
             yield from asked
 
     def _refine(
-        self, query: Query, hypothesis: Hypothesis, prior: ArrayLike | None
+        self, query: Query, hypothesis: Hypothesis, prior: ArrayLike | None, describe: bool
     ) -> Refinement:
         return self._refiner.refine(
             query,
             hypothesis.T_scene_cam,
             near=hypothesis.source == "prior",
             prior=None if prior is None else self._T_map_scene.inverse().camera(prior),
-            describe=hypothesis.describe,
+            align=hypothesis.align,
+            describe=describe,
         )
 
     def _unless_ambiguous(
@@ -194,7 +200,7 @@ class Localizer:
         if rival is None or found.shift(query.camera, rival) < _SAME_PLACE:
             return result
         hypothesis = replace(hypothesis, T_scene_cam=rival)
-        other_found = self._refine(query, hypothesis, None)
+        other_found = self._refine(query, hypothesis, None, hypothesis.describe)
         other = self._result(hypothesis, other_found)
         if not other.ok or other_found.T_scene_cam is None:
             return result

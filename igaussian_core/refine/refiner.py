@@ -97,6 +97,9 @@ class Refiner:
         render: renders the map.
         matcher: of the query's features.
         keypoints: extracted on each render that is matched by descriptors.
+
+    Attributes:
+        match_ms: what matching descriptors took lately where nothing guided it; 0 at first.
     """
 
     def __init__(
@@ -115,10 +118,11 @@ class Refiner:
         self._scale = SCALES[config.scale]() if config.solver == "paper" else None
         self._config = config
         self._verify = verify
+        self.match_ms = 0.0
 
     def refine(
         self, query: Query, T_scene_cam: Array, near: bool = False, prior: Array | None = None,
-        describe: bool = True,
+        align: bool = True, describe: bool = True,
     ) -> Refinement:  # fmt: skip
         """The pose near a hypothesis, by alignment where that convinces, else by descriptors.
 
@@ -130,23 +134,28 @@ class Refiner:
             near: the hypothesis comes from the last frame: it is aligned at once, and
                 descriptors are compared only near where the render says the points should be.
             prior: T_scene_cam where the camera was expected, whatever the hypothesis is.
+            align: try alignment first.
             describe: match descriptors where alignment does not convince.
         """
-        found = self._found(query, T_scene_cam, near, describe)
+        found = self._found(query, T_scene_cam, near, align, describe)
         if not self._status(found).ok:
             return found
         return self._compared(query, self.polish(query, found), prior)
 
     def _found(
-        self, query: Query, T_scene_cam: Array, near: bool, describe: bool
+        self, query: Query, T_scene_cam: Array, near: bool, align: bool, describe: bool
     ) -> Refinement:
         aligned = Refinement(None, None, Evidence("align"))
-        start = T_scene_cam if near else self.approach(query, T_scene_cam)
-        if start is not None:
+        start = T_scene_cam if near or not align else self.approach(query, T_scene_cam)
+        if align and start is not None:
             aligned = self.align(query, start)
         if self._status(aligned) is Status.OK or not describe:
             return aligned
+        began_ms = query.timer.elapsed_ms()
         matched = self.match(query, T_scene_cam, near)
+        if not near:
+            took_ms = query.timer.elapsed_ms() - began_ms
+            self.match_ms = 0.5 * (took_ms + (self.match_ms or took_ms))
         if matched.T_scene_cam is None or not self._status(matched).ok:
             return matched
         polished = self.align(query, matched.T_scene_cam)

@@ -38,7 +38,7 @@ from igaussian_core.views import spherical_views, spread_indices
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
-FOR_MEMORY = EpisodeOptions(steps=240, views=96, learning_rate=1e-3, validate_every=60)
+FOR_MEMORY = EpisodeOptions(steps=180, views=96, learning_rate=1e-3, validate_every=60)
 FOR_HEADS = TrainOptions(steps=2000)  # from random weights
 FOR_HEADS_FROM_WEIGHTS = TrainOptions(steps=1000, learning_rate=1e-3)  # of a joint training
 BANK = 6000  # views that heads are trained on at a time

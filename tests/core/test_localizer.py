@@ -31,6 +31,8 @@ from igaussian_core.geometry import (
 from igaussian_core.localizer import Localizer
 from igaussian_core.map_package import open_package, with_T_map_scene
 from igaussian_core.query import Query
+from igaussian_core.refine.refiner import Refinement
+from igaussian_core.refine.verify import Evidence
 from igaussian_core.result import LocalizationResult, Status
 from igaussian_core.timing import StageTimer
 
@@ -256,6 +258,31 @@ def test_time_that_is_over_is_told(room_igmap: Path, room_map: GaussianMap) -> N
     assert result.status is Status.TIMEOUT and not result.ok and result.T_map_cam is None
     assert "1 ms" in result.reason and "the best" in result.reason
     assert "coarse" not in result.timings_ms  # no time was spent to find that out
+
+
+def test_a_track_s_frame_matches_no_descriptors_that_would_end_too_late(
+    room_igmap: Path, room_map: GaussianMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the prior is wrong, places are still aligned to; from nothing they are matched."""
+    localizer = Localizer.open(room_igmap, Config.from_flat({"runtime.budget_ms": 60000.0}))
+    refiner, described = localizer._refiner, []
+    matched = refiner.match
+
+    def match(query: Query, T_scene_cam: np.ndarray, near: bool = False) -> Refinement:
+        described.append(near)
+        return matched(query, T_scene_cam, near)
+
+    monkeypatch.setattr(refiner, "match", match)
+    monkeypatch.setattr(refiner, "align", lambda query, T: Refinement(None, None, Evidence("")))
+    image = room.photo(room_map, QUERIES[0])
+    away = QUERIES[0] @ compose(rotation_from_vector([0, np.pi, 0]), [0, 0, 0])
+    assert_right(localizer.localize(image, room.CAMERA, away), QUERIES[0], degrees=0.3)
+    assert described == [True, False] and refiner.match_ms > 0
+
+    refiner.match_ms = 1e9
+    result = localizer.localize(image, room.CAMERA, away)
+    assert result.status is Status.TIMEOUT and described[2:] == [True]
+    assert localizer.localize(image, room.CAMERA).ok and described[3:] == [False]
 
 
 @pytest.mark.parametrize("size", [(319, 240), (240, 320), (640, 480)])

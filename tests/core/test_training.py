@@ -391,9 +391,9 @@ def test_the_localizer_asks_the_network_first(
     cascade.warm_up()
     result = cascade.localize(image, rooms.CAMERA)
     query = Query(image, rooms.CAMERA, cascade._matcher, 256, StageTimer())
-    asked = [(h.source, h.describe) for h in cascade._hypotheses(query, None)]
-    assert asked[0] == ("network", False) and asked[-1] == ("network", True)
-    assert ("landmarks", True) in asked
+    asked = [(h.source, h.align, h.describe) for h in cascade._hypotheses(query, None)]
+    assert asked[0] == ("network", True, False) and asked[-1] == ("network", False, True)
+    assert ("landmarks", True, True) in asked
     assert result.ok and result.source in ("network", "landmarks")
     alone = Localizer(with_network, Config.from_flat({"coarse.method": "network"}))
     assert alone.localize(image, rooms.CAMERA).source == "network"
