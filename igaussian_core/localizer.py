@@ -332,7 +332,7 @@ def _ambiguous(result: LocalizationResult, other: LocalizationResult) -> Localiz
 
 
 def _out_of_time(best: LocalizationResult, budget_ms: float) -> LocalizationResult:
-    reason = f"{budget_ms:.0f} ms were over before all places were tried; the best: {best.reason}"
+    reason = f"not all places could be tried in {budget_ms:.0f} ms; the best: {best.reason}"
     return replace(best, status=Status.TIMEOUT, reason=reason)
 
 
