@@ -33,7 +33,7 @@ from igaussian_core.geometry import mean_rotation, nearest_rotation, rotation_fr
 Array = NDArray[np.float64]
 
 GRID = 2  # features are averaged over so many by so many parts of the image
-_RIDGE = 0.001  # of the kernel's value at zero distance
+_RIDGE = 0.0005  # of the kernel's value at zero distance
 _WIDTH = 1.0  # of the kernel, in median distances of keys
 _LARGEST_RIDGE = 1.0
 _SAMPLE = 512  # keys whose distances tell the median

@@ -19,7 +19,7 @@ from igaussian_core.coarse.network import MapNetwork, load_checkpoint, shipped_c
 from igaussian_core.coarse.pose_scale import PoseScale
 from igaussian_core.map_package import MapPackage, open_package, with_network
 from igaussian_core.sphere import Sphere, sphere_of
-from igaussian_core.training.augment import augmented, composite
+from igaussian_core.training.augment import augmented, composite, unchanged
 from igaussian_core.training.bank import Bank, ViewRenderer, draw_views
 from igaussian_core.training.episodes import EpisodeMap, EpisodeOptions, MemoryTrainer
 from igaussian_core.training.pose_network import (
@@ -198,7 +198,8 @@ def remember(
 ) -> ViewMemory | None:  # fmt: skip
     """A memory of `count` views: those of the bank, and new ones; None of none.
 
-    Each is changed as in training, so that the regression knows how much that does.
+    Every other is changed as in training, so that the regression knows how much that does, and
+    what is seen unchanged too.
     """
     if count == 0:
         return None
@@ -214,7 +215,8 @@ def remember(
             views = draw_views(
                 setting.renderer, setting.sampler, rng, min(_CHUNK, count - done)
             )
-        images = augmented(views.rgba, setting.background, random)
+        images = unchanged(views.rgba, setting.background)
+        images[::2] = augmented(views.rgba[::2], setting.background, random)
         keys.append(raw_keys(network.backbone(images)))
         rotations.append(views.rotation)
         positions.append(views.position)
