@@ -29,7 +29,6 @@ from igaussian_core.evaluate.rendered import (
     RenderedQueries,
     camera_of,
     shows_enough,
-    sphere_of,
     targets,
 )
 from igaussian_core.features import XFeatMatcher
@@ -42,6 +41,7 @@ from igaussian_core.procedural import make_object, make_room
 from igaussian_core.refine.refiner import to_u8
 from igaussian_core.refine.relative import bearings, depth_scale, relative_pose
 from igaussian_core.refine.scale_vit import LearnedLength
+from igaussian_core.sphere import sphere_of
 from igaussian_core.views import look_at
 
 Array = NDArray[np.float64]

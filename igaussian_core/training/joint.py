@@ -70,15 +70,18 @@ def train_jointly(
     seeds = range(options.seed, options.seed + held_out + maps)
     with ProcessPoolExecutor(threads, get_context("spawn")) as workers:
         coming = ComingMaps([workers.submit(_made, seed) for seed in seeds], device)
-        at_first = held_out + min(_AT_FIRST, maps)
-        for count in range(1, at_first + 1):
-            coming.first(count)
-            progress("maps", count, at_first)
-        trainer = JointTrainer(
-            PoseNetwork(config or NetworkConfig()), coming, held_out, options, checkpoint,
-            threads, device,
-        )  # fmt: skip
-        curve = trainer.run(progress)
+        try:
+            at_first = held_out + min(_AT_FIRST, maps)
+            for count in range(1, at_first + 1):
+                coming.first(count)
+                progress("maps", count, at_first)
+            trainer = JointTrainer(
+                PoseNetwork(config or NetworkConfig()), coming, held_out, options, checkpoint,
+                threads, device,
+            )  # fmt: skip
+            curve = trainer.run(progress)
+        finally:  # an interrupted training waits for no more maps
+            workers.shutdown(cancel_futures=True)
     return trainer.network.cpu(), curve
 
 
