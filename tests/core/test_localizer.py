@@ -266,6 +266,7 @@ def test_a_track_s_frame_matches_no_descriptors_that_would_end_too_late(
     """Where the prior is wrong, places are still aligned to; from nothing they are matched."""
     localizer = Localizer.open(room_igmap, Config.from_flat({"runtime.budget_ms": 60000.0}))
     refiner, described = localizer._refiner, []
+    before_ms = refiner.match_ms
     matched = refiner.match
 
     def match(query: Query, T_scene_cam: np.ndarray, near: bool = False) -> Refinement:
@@ -277,7 +278,7 @@ def test_a_track_s_frame_matches_no_descriptors_that_would_end_too_late(
     image = room.photo(room_map, QUERIES[0])
     away = QUERIES[0] @ compose(rotation_from_vector([0, np.pi, 0]), [0, 0, 0])
     assert_right(localizer.localize(image, room.CAMERA, away), QUERIES[0], degrees=0.3)
-    assert described == [True, False] and refiner.match_ms > 0
+    assert described == [True, False] and refiner.match_ms != before_ms
 
     refiner.match_ms = 1e9
     result = localizer.localize(image, room.CAMERA, away)
