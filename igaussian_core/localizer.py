@@ -109,10 +109,12 @@ class Localizer:
                 failure = _out_of_time(failure, budget_ms)
                 break
             # the next frame of a track is worth more than the last place of this one
-            late = prior is not None and hypothesis.source != "prior"
-            late = late and timer.elapsed_ms() + self._refiner.match_ms > budget_ms
-            describe = hypothesis.describe and not late
-            refinement = self._refine(query, hypothesis, prior, describe)
+            late = (
+                prior is not None and hypothesis.source != "prior" and hypothesis.describe
+                and timer.elapsed_ms() + self._refiner.match_ms > budget_ms
+            )  # fmt: skip
+            tried = replace(hypothesis, describe=False) if late else hypothesis
+            refinement = self._refine(query, tried, prior)
             result = self._result(hypothesis, refinement)
             if result.ok:
                 if timer.elapsed_ms() <= budget_ms:
@@ -120,7 +122,7 @@ class Localizer:
                 return _timed(result, timer)
             if result.inliers >= failure.inliers:
                 failure = result
-            over = timer.elapsed_ms() > budget_ms or describe != hypothesis.describe
+            over = late or timer.elapsed_ms() > budget_ms
             if over and hypothesis.source != "landmarks":  # whose search would take longer still
                 failure = _out_of_time(failure, budget_ms)
                 break
@@ -181,7 +183,7 @@ class Localizer:
             yield from asked
 
     def _refine(
-        self, query: Query, hypothesis: Hypothesis, prior: ArrayLike | None, describe: bool
+        self, query: Query, hypothesis: Hypothesis, prior: ArrayLike | None
     ) -> Refinement:
         return self._refiner.refine(
             query,
@@ -189,7 +191,7 @@ class Localizer:
             near=hypothesis.source == "prior",
             prior=None if prior is None else self._T_map_scene.inverse().camera(prior),
             align=hypothesis.align,
-            describe=describe,
+            describe=hypothesis.describe,
         )
 
     def _unless_ambiguous(
@@ -200,7 +202,7 @@ class Localizer:
         if rival is None or found.shift(query.camera, rival) < _SAME_PLACE:
             return result
         hypothesis = replace(hypothesis, T_scene_cam=rival)
-        other_found = self._refine(query, hypothesis, None, hypothesis.describe)
+        other_found = self._refine(query, hypothesis, None)
         other = self._result(hypothesis, other_found)
         if not other.ok or other_found.T_scene_cam is None:
             return result
