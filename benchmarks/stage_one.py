@@ -8,7 +8,7 @@ memory from those, with --heads that trained for the paper's heads, and the land
 paper's protocol (300 rendered targets) and on held-out photos. `ablation` (the paper's table 4,
 stage one) and `views` (figure 5): lego, from random weights with --short-steps each, so that only
 the part in question differs. Networks predict by their heads ("heads": candidates and weights of
-the source views) and by the memory of views of known pose. A trained network is kept in --work,
+the source views) and by the memory of views of known pose, in one pass and corrected by one render. A trained network is kept in --work,
 so that an interrupted benchmark goes on. Needs the data folder (_data.py).
 """
 
@@ -168,20 +168,23 @@ def _judged(
     """Rows of a network's heads and of its memory, or one of the landmarks."""
     rows = []
     trained = network is not None and _report(network).get("heads")
-    for head in ("attention", "memory") if trained else ("memory",) if network else ("",):
+    heads = ("attention", "memory") if trained else ("memory",)
+    asked = [(head, renders) for head in heads for renders in (0, 1)] if network else [("", 0)]
+    for head, renders in asked:
         config = Config.from_flat(
-            {"coarse.method": "network", "coarse.network_head": head} if network
+            {"coarse.method": "network", "coarse.network_head": head,
+             "coarse.network_renders": renders} if network
             else {"coarse.method": "landmarks"}
         )  # fmt: skip
         estimator = CoarseOnly(dataclasses.replace(package, network=network), config)
-        row: dict[str, Any] = {"case": name, "method": method, "head": head}
+        row: dict[str, Any] = {"case": name, "method": method, "head": head, "renders": renders}
         if network:
             row |= {"train_s": float(network.meta["seconds"]), "steps": int(network.meta["steps"])}
         row["rendered"], row["groups"] = _figures(estimator, _rendered(package, options.targets))
         if name != DEMO_ROOM:
             queries, row["extent"] = _photos(package, name)
             row["photos"], _ = _figures(estimator, queries)
-        print(name, method, head, json.dumps(
+        print(name, method, head, renders, json.dumps(
             {k: _short(v) for k, v in row.items() if isinstance(v, dict)}), flush=True
         )  # fmt: skip
         rows.append(row)

@@ -82,6 +82,10 @@ class CoarseConfig:
     network_hypotheses: int = _option(
         4, "hypotheses of the pose network handed to stage two", 1, 16
     )
+    network_renders: int = _option(
+        1, "renders by which the first hypothesis of method=network is corrected: what the network "
+        "says of them shows by how much it errs there; 0: the paper's single pass", 0, 4
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

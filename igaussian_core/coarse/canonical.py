@@ -12,6 +12,9 @@ from igaussian_core.camera import Camera
 from igaussian_core.coarse.backbone import STRIDE
 
 _PIXELS = 128 * 128
+# renders of a map are made so many times as large and averaged, about the size of the images
+# that maps are trained with: in small ones the low-pass filter leaves Gaussians too soft
+OVERSAMPLING = 3
 
 
 def canonical_camera(camera: Camera) -> Camera:

@@ -1,4 +1,4 @@
-"""Hypotheses from the pose network: one forward pass, no iterations, no prior."""
+"""Hypotheses from the pose network: no prior, no iterations; one render back where asked for."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from torch import Tensor
 from igaussian_core.camera import Camera
 from igaussian_core.coarse.attention import NetworkConfig, PoseNetwork, SourceViews
 from igaussian_core.coarse.canonical import cell_rays, resampled, to_tensor
+from igaussian_core.coarse.look_back import Render, looked_back
 from igaussian_core.coarse.memory import GRID, ViewMemory, recall
 from igaussian_core.coarse.pose_scale import PoseScale
 from igaussian_core.errors import MapError
@@ -99,11 +100,17 @@ class NetworkLocalizer:
         trained: the map's network.
         hypotheses: most that are handed on.
         head: "memory", where there is one, or "attention".
+        render: of the map; None: no answer is corrected.
+        renders: by how many the first hypothesis is corrected.
     """
 
-    def __init__(self, trained: MapNetwork, hypotheses: int, head: str = "memory") -> None:
+    def __init__(
+        self, trained: MapNetwork, hypotheses: int, head: str = "memory",
+        render: Render | None = None, renders: int = 0,
+    ) -> None:  # fmt: skip
         self._trained = trained
         self._count = hypotheses
+        self._render, self._renders = render, renders if render else 0
         self._memory = trained.memory if head == "memory" else None
         if self._memory is not None:  # widened once, not for every frame
             self._memory = self._memory._replace(keys=self._memory.keys.float())
@@ -121,19 +128,31 @@ class NetworkLocalizer:
             camera: its pinhole camera.
         """
         found: list[Array] = []
-        for T_scene_cam, score in self._poses(image, camera):
-            if len(found) == self._count:
+        small = resampled(image, camera, self._trained.camera)
+        answers = self._answers(small)
+        first, score = next(answers)
+        found.append(self._corrected(small, first) if self._renders else first)
+        yield Hypothesis(found[0], score, "network")
+        for T_scene_cam, score in answers:
+            if len(found) >= self._count:
                 return
             if all(self._differs(T_scene_cam, other) for other in found):
                 found.append(T_scene_cam)
                 yield Hypothesis(T_scene_cam, score, "network")
 
-    def _poses(self, image: Image, camera: Camera) -> Iterator[tuple[Array, float]]:
-        trained = self._trained
-        image = resampled(image, camera, trained.camera)
-        found = self._attended(image) if self._memory is None else self._remembered(image)
+    def _corrected(self, small: Image, T_scene_cam: Array) -> Array:
+        assert self._render is not None
+        return looked_back(
+            small, self._trained.camera, T_scene_cam,
+            lambda seen: next(self._answers(seen))[0],
+            self._render, self._renders, self._trained.scale.length,
+        )  # fmt: skip
+
+    def _answers(self, small: Image) -> Iterator[tuple[Array, float]]:
+        """Poses T_scene_cam and scores of an image of the canonical camera."""
+        found = self._attended(small) if self._memory is None else self._remembered(small)
         for rotation, position, score in found:
-            yield compose(rotation, trained.scale.scene(position)), score
+            yield compose(rotation, self._trained.scale.scene(position)), score
 
     def _remembered(self, image: Image) -> Iterator[tuple[Array, Array, float]]:
         assert self._memory is not None

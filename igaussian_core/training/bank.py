@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ Array = NDArray[np.float64]
 _MIN_COVERED = 0.6  # share of a scene's view that the map must cover
 _MIN_CONTRAST = 6.0  # grey levels: a bare ceiling tells nobody where he is
 _CHUNK = 64
+_TOGETHER = 16  # views that are rendered at once
 _TRIES = 60  # chunks without a usable view before a map is given up
 _WORST_YIELD = 0.02  # share of usable views below which it is given up as well
 
@@ -74,6 +76,8 @@ class ViewRenderer:
         camera: the network's canonical camera.
         scale: normalisation of positions.
         min_covered: share of a view that the map must cover for it to be used.
+        oversampling: views are rendered so many times as large and made small by averaging, as
+            images are: at 128 pixels the renderer's low-pass filter leaves them too soft.
     """
 
     gmap: GaussianMap
@@ -81,31 +85,48 @@ class ViewRenderer:
     scale: PoseScale
     min_covered: float
     threads: int = 2
+    oversampling: int = 1
 
     def render(self, T_scene_cam: Array) -> tuple[Views, NDArray[np.bool_]]:
         """Views of poses [N, 4, 4], and which of them show enough."""
         T = np.asarray(T_scene_cam, np.float64)
-        render = self.gmap.rasterizer().render_batch(
-            self.camera, inverse(T), threads=self.threads
-        )
-        assert render.rgb is not None and render.depth is not None and render.alpha is not None
-        alpha = render.alpha[..., None]
-        rgba = np.concatenate([np.clip(render.rgb, 0, 1), alpha], -1) * 255 + 0.5
+        rgba, depth = self._images(T)
+        alpha = rgba[..., 3]
         u, v = np.round(np.moveaxis(cell_centres(self.camera), -1, 0)).astype(int)
         rays = cell_rays(self.camera).numpy().astype(np.float64)
         ahead = np.concatenate([rays, np.ones_like(rays[..., :1])], -1)
-        points = ahead * render.depth[:, v, u, None].astype(np.float64)
+        points = ahead * depth[:, v, u, None].astype(np.float64)
         points = np.einsum("nij,nhwj->nhwi", T[:, :3, :3], points) + T[:, None, None, :3, 3]
         views = Views(
-            rgba=torch.from_numpy(rgba.astype(np.uint8)),
+            rgba=torch.from_numpy((rgba * 255 + 0.5).astype(np.uint8)),
             points=torch.from_numpy(contracted(self.scale.normalized(points)).astype(np.float32)),
-            known=torch.from_numpy(render.alpha[:, v, u] > 0.5),
+            known=torch.from_numpy(alpha[:, v, u] > 0.5),
             rotation=torch.from_numpy(T[:, :3, :3].astype(np.float32)),
             position=torch.from_numpy(self.scale.normalized(T[:, :3, 3]).astype(np.float32)),
         )
-        covered = (render.alpha > 0.5).mean(axis=(1, 2))
-        contrast = rgba[..., :3].mean(-1).std(axis=(1, 2))
+        covered = (alpha > 0.5).mean(axis=(1, 2))
+        contrast = 255 * rgba[..., :3].mean(-1).std(axis=(1, 2))
         return views, (covered >= self.min_covered) & (contrast >= _MIN_CONTRAST)
+
+    def _images(self, T_scene_cam: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Premultiplied RGBA [N, H, W, 4] in [0, 1], and depth [N, H, W] where alpha allows."""
+        k, small = self.oversampling, self.camera
+        camera = small.resized(k * small.width, k * small.height)
+        rgba = np.empty((len(T_scene_cam), small.height, small.width, 4), np.float32)
+        depth = np.empty(rgba.shape[:3], np.float32)
+        for first in range(0, len(T_scene_cam), _TOGETHER):
+            part = slice(first, first + _TOGETHER)
+            render = self.gmap.rasterizer().render_batch(
+                camera, inverse(T_scene_cam[part]), threads=self.threads
+            )
+            assert render.rgb is not None and render.depth is not None
+            assert render.alpha is not None
+            for i, image in enumerate(render.rgb):
+                image = np.dstack([np.clip(image, 0, 1), render.alpha[i]])
+                size = (small.width, small.height)
+                rgba[first + i] = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            depth[part] = render.depth[:, k // 2 :: k, k // 2 :: k]
+        return rgba, depth
 
 
 def draw_views(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from igaussian_core.camera import Camera
 from igaussian_core.coarse.attention import PoseNetwork
-from igaussian_core.coarse.canonical import canonical_camera, cell_rays
+from igaussian_core.coarse.canonical import OVERSAMPLING, canonical_camera, cell_rays
 from igaussian_core.coarse.memory import ViewMemory, fit_memory, raw_keys, recall
 from igaussian_core.coarse.network import MapNetwork, load_checkpoint, shipped_checkpoint
 from igaussian_core.coarse.pose_scale import PoseScale
@@ -75,8 +75,8 @@ def setting_of(package: MapPackage, sources: int = 16, threads: int = 2) -> Sett
     camera = canonical_camera(Camera(int(width), int(height), fx, fy, cx, cy))
     is_object = sphere.kind == "object"
     renderer = ViewRenderer(
-        package.gaussians.for_small_images(), camera, scale, 0.0 if is_object else _MIN_COVERED,
-        threads,
+        package.gaussians, camera, scale, 0.0 if is_object else _MIN_COVERED, threads,
+        OVERSAMPLING,
     )  # fmt: skip
     sampler = PoseSampler(sphere, scale.length, known, _NEAR_KNOWN[sphere.kind])
     if is_object:
