@@ -8,8 +8,9 @@ memory from those, with --heads that trained for the paper's heads, and the land
 paper's protocol (300 rendered targets) and on held-out photos. `ablation` (the paper's table 4,
 stage one) and `views` (figure 5): lego, from random weights with --short-steps each, so that only
 the part in question differs. Networks predict by their heads ("heads": candidates and weights of
-the source views) and by the memory of views of known pose, in one pass and corrected by one render. A trained network is kept in --work,
-so that an interrupted benchmark goes on. Needs the data folder (_data.py).
+the source views) and by the memory of views of known pose, in one pass and corrected by what they
+say of one render. A trained network is kept in --work, so that an interrupted benchmark goes on.
+Needs the data folder (_data.py).
 """
 
 from __future__ import annotations

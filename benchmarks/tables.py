@@ -189,7 +189,7 @@ def _stage_one_table(rows: Sequence[Row]) -> str:
             *(f"{b}°: med °, distance, ≤ 15°" for b in bins),
             "photos: med °, distance, ≤ 15°", "ms"]  # fmt: skip
     return markdown(head, [
-        [row["case"], row["method"], _HEADS[row["head"]], _training(row),
+        [row["case"], row["method"], _head(row), _training(row),
          *(_errors(row["groups"][b]) for b in bins), _errors(row.get("photos"), row.get("extent")),
          value(row["rendered"], "median_ms")]
         for row in rows
@@ -197,6 +197,10 @@ def _stage_one_table(rows: Sequence[Row]) -> str:
 
 
 _HEADS = {"attention": "heads", "memory": "memory", "": "–"}
+
+
+def _head(row: Row) -> str:
+    return _HEADS[row["head"]] + (", one render" if row.get("renders") else "")
 
 
 def _training(row: Row) -> str:
