@@ -149,16 +149,32 @@ def fit_memory(
     basis = directions[:, -dimensions:].flip(1).float().contiguous()
     keys = ((raw - centre) @ basis).half()
     poses = torch.cat([rotation.flatten(1), position], 1)
-    width, mean, coefficients = fit_regression(keys.float(), poses, _RIDGE)
+    _, width, mean, coefficients = fit_regression(keys.float(), poses, _RIDGE)
     return ViewMemory(centre, basis, keys, width.reshape(1), poses, mean, coefficients)
 
 
-def fit_regression(keys: Tensor, values: Tensor, ridge: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Kernel ridge regression of values [N, V] by keys [N, E].
+class Regression(NamedTuple):
+    """Kernel ridge regression of values [V] by keys [E].
 
-    Returns:
-        The kernel's width, the values' mean [V], and coefficients [N, V]: values at other keys are
-        matern(distances, width) @ coefficients + mean.
+    Attributes:
+        keys: [N, E] at which values are known.
+        width: of the kernel.
+        mean: [V] of the values.
+        coefficients: [N, V].
+    """
+
+    keys: Tensor
+    width: Tensor
+    mean: Tensor
+    coefficients: Tensor
+
+    def predict(self, keys: Tensor) -> Tensor:
+        """Values [B, V] at other keys [B, E]."""
+        return matern(torch.cdist(keys, self.keys), self.width) @ self.coefficients + self.mean
+
+
+def fit_regression(keys: Tensor, values: Tensor, ridge: float) -> Regression:
+    """Of values [N, V] at keys [N, E].
 
     Raises:
         MapError: keys that cannot be told apart, or are not finite.
@@ -171,7 +187,7 @@ def fit_regression(keys: Tensor, values: Tensor, ridge: float) -> tuple[Tensor, 
         factor, failed = torch.linalg.cholesky_ex(gram)
         del gram
         if not failed:
-            return width, mean, torch.cholesky_solve(values - mean, factor)
+            return Regression(keys, width, mean, torch.cholesky_solve(values - mean, factor))
         ridge *= 10  # many views alike
     raise MapError("pose network: the map's views cannot be told apart")
 

@@ -236,8 +236,7 @@ class MemoryTrainer(EpisodeTrainer):
         self.network.eval()
         keys, queries = _keys(self.network, known), _keys(self.network, asked)
         self.network.train()
-        width, mean, coefficients = fit_regression(keys, known.views.poses, _RIDGE)
-        poses = matern(torch.cdist(queries, keys), width) @ coefficients + mean
+        poses = fit_regression(keys, known.views.poses, _RIDGE).predict(queries)
         degrees, lengths = pose_errors(poses, asked.views)
         return degrees.numpy(), lengths.numpy()
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from igaussian_core.coarse.memory import fit_regression, matern
+from igaussian_core.coarse.memory import Regression, fit_regression
 from igaussian_core.training.bank import Views
 
 _MOST = 2048  # views
@@ -24,7 +24,7 @@ class RecentViews:
 
     def __init__(self) -> None:
         self._keys, self._poses = torch.zeros(0, 0), torch.zeros(0, 12)
-        self._fit: tuple[Tensor, Tensor, Tensor, Tensor] | None = None
+        self._fit: Regression | None = None
         self._new = 0
 
     @torch.no_grad()
@@ -35,12 +35,9 @@ class RecentViews:
         self._new += len(keys)
         if len(self._keys) >= _LEAST and self._new >= _REFIT_EVERY:
             self._new = 0
-            self._fit = (self._keys, *fit_regression(self._keys, self._poses, _RIDGE))
+            self._fit = fit_regression(self._keys, self._poses, _RIDGE)
 
     def predict(self, keys: Tensor) -> Tensor | None:
         """Poses [B, 12], rotation by rows and position, of raw keys; None before there are
         enough views."""
-        if self._fit is None:
-            return None
-        known, width, mean, coefficients = self._fit
-        return matern(torch.cdist(keys, known), width) @ coefficients + mean
+        return None if self._fit is None else self._fit.predict(keys)
