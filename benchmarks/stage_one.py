@@ -8,8 +8,8 @@ memory from those, with --heads that trained for the paper's heads, and the land
 paper's protocol (300 rendered targets) and on held-out photos. `ablation` (the paper's table 4,
 stage one) and `views` (figure 5): lego, from random weights with --short-steps each, so that only
 the part in question differs. Networks predict by their heads ("heads": candidates and weights of
-the source views) and by the memory of views of known pose, in one pass and corrected by what they
-say of one render. A trained network is kept in --work, so that an interrupted benchmark goes on.
+the source views) and by the memory of views of known pose; of `maps` in one pass, and corrected by
+what they say of one and of two renders. A trained network is kept in --work, so that an interrupted benchmark goes on.
 Needs the data folder (_data.py).
 """
 
@@ -112,7 +112,7 @@ def maps_table(options: argparse.Namespace) -> list[dict[str, Any]]:
                 package, load_checkpoint(shipped_checkpoint()), training, 16, MEMORY,
                 network_file(name, file, options.work), options.threads,
             )  # fmt: skip
-            rows += _judged(package, name, label, trained, options)
+            rows += _judged(package, name, label, trained, options, (0, 1, 2))
         rows += _judged(package, name, "landmarks (no training)", None, options)
     return rows
 
@@ -164,13 +164,14 @@ def _trained(
 
 def _judged(
     package: MapPackage, name: str, method: str, network: NetworkData | None,
-    options: argparse.Namespace,
+    options: argparse.Namespace, corrections: tuple[int, ...] = (0,),
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Rows of a network's heads and of its memory, or one of the landmarks."""
+    """Rows of a network's heads and of its memory, corrected by so many renders each, or one of
+    the landmarks."""
     rows = []
     trained = network is not None and _report(network).get("heads")
     heads = ("attention", "memory") if trained else ("memory",)
-    asked = [(head, renders) for head in heads for renders in (0, 1)] if network else [("", 0)]
+    asked = [(h, count) for h in heads for count in corrections] if network else [("", 0)]
     for head, renders in asked:
         config = Config.from_flat(
             {"coarse.method": "network", "coarse.network_head": head,

@@ -171,7 +171,7 @@ def stage_one(data: Row) -> str:
         "The first hypothesis, unverified. Distances are in map units; a photo's are followed by "
         "their share of the cameras' extent. Heads: the paper's candidates and weights of the "
         "source views; memory: kernel regression among thousands of views of known pose, by the "
-        "same network's features.",
+        "same network's features; with one or two renders: corrected by what it says of those.",
     ]
     titles = {
         "maps": "Each map", "ablation": "What each part adds (table 4, stage one)",
@@ -200,7 +200,8 @@ _HEADS = {"attention": "heads", "memory": "memory", "": "–"}
 
 
 def _head(row: Row) -> str:
-    return _HEADS[row["head"]] + (", one render" if row.get("renders") else "")
+    renders = ("", ", one render", ", two renders")[row.get("renders", 0)]
+    return _HEADS[row["head"]] + renders
 
 
 def _training(row: Row) -> str:
