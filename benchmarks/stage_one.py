@@ -9,8 +9,8 @@ paper's protocol (300 rendered targets) and on held-out photos. `ablation` (the 
 stage one) and `views` (figure 5): lego, from random weights with --short-steps each, so that only
 the part in question differs. Networks predict by their heads ("heads": candidates and weights of
 the source views) and by the memory of views of known pose; of `maps` in one pass, and corrected by
-what they say of one and of two renders. A trained network is kept in --work, so that an interrupted benchmark goes on.
-Needs the data folder (_data.py).
+what they say of one and of two renders. A trained network is kept in --work, so that an
+interrupted benchmark goes on. Needs the data folder (_data.py).
 """
 
 from __future__ import annotations
