@@ -107,7 +107,8 @@ SOLVER = Config.from_flat(
     {**_UNLIMITED, "refine.solver": "paper", "refine.scale": "depth"}
 )
 SOLVER_VIT = Config.from_flat({**_UNLIMITED, "refine.solver": "paper", "refine.scale": "vit"})
-_HEADS = {**_UNLIMITED, "coarse.method": "network", "coarse.network_head": "attention"}
+_HEADS = {**_UNLIMITED, "coarse.method": "network", "coarse.network_head": "attention",
+          "coarse.network_renders": 0}  # fmt: skip
 HEADS = Config.from_flat(_HEADS)
 SIFT = dataclasses.replace(CONFIG, features=dataclasses.replace(CONFIG.features, matcher="sift"))
 
