@@ -61,7 +61,11 @@ def looked_back(
 
 def exposed(render: Image, image: Image) -> Image:
     """A render with the image's exposure and white balance: each channel times the median of
-    the ratios."""
+    the ratios.
+
+    A gain alone: with an offset besides (`colour.fit_colour`) what a pose is off by passes for
+    a change of colours.
+    """
     soft_render, soft_image = (
         cv2.GaussianBlur(part, (0, 0), _BLUR_PX).astype(np.float32) for part in (render, image)
     )

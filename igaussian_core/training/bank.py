@@ -111,6 +111,7 @@ class ViewRenderer:
     def _images(self, T_scene_cam: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Premultiplied RGBA [N, H, W, 4] in [0, 1], and depth [N, H, W] where alpha allows."""
         k, small = self.oversampling, self.camera
+        size = (small.width, small.height)
         camera = small.resized(k * small.width, k * small.height)
         rgba = np.empty((len(T_scene_cam), small.height, small.width, 4), np.float32)
         depth = np.empty(rgba.shape[:3], np.float32)
@@ -123,7 +124,6 @@ class ViewRenderer:
             assert render.alpha is not None
             for i, image in enumerate(render.rgb):
                 image = np.dstack([np.clip(image, 0, 1), render.alpha[i]])
-                size = (small.width, small.height)
                 rgba[first + i] = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
             depth[part] = render.depth[:, k // 2 :: k, k // 2 :: k]
         return rgba, depth

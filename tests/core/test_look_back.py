@@ -15,8 +15,6 @@ Image = NDArray[np.uint8]
 
 CAMERA = Camera(128, 96, 100.0, 100.0, 63.5, 47.5)
 TRUTH = compose(rotation_from_vector([0.3, -0.2, 0.1]), [1.0, -2.0, 0.5])
-
-
 IMAGE = np.full((CAMERA.height, CAMERA.width, 3), 40, np.uint8)
 
 
