@@ -22,7 +22,8 @@ from igaussian_core.hypothesis import Hypothesis
 from igaussian_core.map_package import Manifest, MapPackage, open_package
 from igaussian_core.query import Query
 from igaussian_core.refine.refiner import Refinement, Refiner
-from igaussian_core.refine.verify import confidence, judge
+from igaussian_core.refine.resemblance import most_alike
+from igaussian_core.refine.verify import Evidence, confidence, judge, thresholds
 from igaussian_core.result import LocalizationResult, Status
 from igaussian_core.timing import StageTimer
 
@@ -162,8 +163,8 @@ class Localizer:
         found as asked for.
 
         In the cascade the network's places are only aligned at first: where that does not
-        convince, the landmarks cost less than matching descriptors at a wrong place. They come
-        again, with descriptors, where the landmarks know none.
+        convince, the landmarks cost less than matching descriptors at a wrong place. Those that
+        resemble the image come again, with descriptors, where the landmarks know none.
         """
         if prior is not None:
             if not is_rigid(prior):
@@ -180,7 +181,11 @@ class Localizer:
                 query, self._landmarks.hypotheses(query.features, query.camera)
             )
         if method == "cascade":
-            yield from asked
+            wanted, _ = thresholds(Evidence(self._matcher.name), self._config.verify)
+            yield from most_alike(
+                query, asked, self._render_scene, self._matcher, self._config.features.keypoints,
+                wanted,
+            )  # fmt: skip
 
     def _refine(
         self, query: Query, hypothesis: Hypothesis, prior: ArrayLike | None

@@ -15,14 +15,23 @@ from igaussian_core.contrast import Gray
 Pixels = NDArray[np.float32]
 
 _MAX_ROUND_TRIP_PX = 0.7
+# least texture of a corner, as a share of the strongest one's; the second where few reach the first
+_QUALITY, _WEAK_QUALITY = 0.02, 0.002
+_ENOUGH = 0.25  # share of the corners asked for
 
 
 def corners(gray: Gray, mask: NDArray[np.bool_], count: int) -> Pixels:
-    """At most `count` well-textured pixels [N, 2] inside a mask, spread over the image."""
+    """At most `count` well-textured pixels [N, 2] inside a mask, spread over the image.
+
+    Weakly textured ones count as well where there are few others: of a bare wall and a clock,
+    the clock's alone tell less than both.
+    """
     spacing = max(4.0, 0.6 * float(np.sqrt(gray.size / max(count, 1))))
-    found = cv2.goodFeaturesToTrack(
-        gray, count, 0.02, spacing, mask=mask.astype(np.uint8) * 255, blockSize=5
-    )
+    inside = mask.astype(np.uint8) * 255
+    for quality in (_QUALITY, _WEAK_QUALITY):
+        found = cv2.goodFeaturesToTrack(gray, count, quality, spacing, mask=inside, blockSize=5)
+        if found is not None and len(found) >= _ENOUGH * count:
+            break
     return np.zeros((0, 2), np.float32) if found is None else found[:, 0].astype(np.float32)
 
 

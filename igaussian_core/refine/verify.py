@@ -46,7 +46,7 @@ class Evidence:
 def judge(evidence: Evidence, config: VerifyConfig) -> tuple[Status, str]:
     """The verdict and its reason in words."""
     e = evidence
-    min_inliers, min_ratio = _thresholds(e, config)
+    min_inliers, min_ratio = thresholds(e, config)
     if e.coverage < config.min_coverage:
         return Status.OUT_OF_MAP, f"the map covers {e.coverage:.0%} of the view"
     if e.matches < min_inliers:
@@ -78,7 +78,7 @@ def confidence(evidence: Evidence, config: VerifyConfig) -> float:
     allowed to be x at most, the other way round. It is no probability.
     """
     e = evidence
-    min_inliers, min_ratio = _thresholds(e, config)
+    min_inliers, min_ratio = thresholds(e, config)
     parts = [
         _at_least(e.coverage, config.min_coverage),
         _at_least(e.inliers, min_inliers),
@@ -104,7 +104,7 @@ def _at_least(value: float, least: float) -> float:
     return 0.5 * (value / least) ** 2
 
 
-def _thresholds(evidence: Evidence, config: VerifyConfig) -> tuple[float, float]:
+def thresholds(evidence: Evidence, config: VerifyConfig) -> tuple[float, float]:
     """Least inliers and inlier ratio of a kind of correspondences; more against a prior."""
     inliers, ratio = {
         "align": (config.min_inliers_align, config.min_ratio_align),

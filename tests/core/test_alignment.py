@@ -86,6 +86,17 @@ def test_corners_are_inside_the_mask_and_spread() -> None:
     assert gaps.min() >= 4.0
 
 
+def test_a_bare_wall_counts_beside_a_clock() -> None:
+    """Its faint texture has corners enough to follow."""
+    wall = np.clip(128 + 0.02 * (texture().astype(float) - 128), 0, 255).astype(np.uint8)
+    image = wall.copy()
+    cv2.circle(image, (160, 120), 25, (20, 20, 20), 3)
+    everywhere = np.ones(image.shape[:2], bool)
+    uv = corners(normalize_contrast(image), everywhere, 200)
+    away = np.linalg.norm(uv - [160, 120], axis=1) > 50
+    assert away.sum() > 60
+
+
 def test_nothing_to_follow() -> None:
     gray = normalize_contrast(texture())
     none = corners(gray, np.zeros(gray.shape, bool), 50)
