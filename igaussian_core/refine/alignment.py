@@ -6,6 +6,8 @@ balance and vignetting out. Keypoint matches are good to about a pixel; these to
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -16,23 +18,56 @@ Pixels = NDArray[np.float32]
 
 _MAX_ROUND_TRIP_PX = 0.7
 # least texture of a corner, as a share of the strongest one's; the second where few reach the first
-_QUALITY, _WEAK_QUALITY = 0.02, 0.002
+_QUALITY, _FAINT_QUALITY = 0.02, 0.002
 _ENOUGH = 0.25  # share of the corners asked for
+_MIN_FAINT_CORRELATION = 0.4  # of a faint corner's patches: noise has less
 
 
-def corners(gray: Gray, mask: NDArray[np.bool_], count: int) -> Pixels:
-    """At most `count` well-textured pixels [N, 2] inside a mask, spread over the image.
+class Followed(NamedTuple):
+    """Points of a render found in an image.
 
-    Weakly textured ones count as well where there are few others: of a bare wall and a clock,
-    the clock's alone tell less than both.
+    Attributes:
+        uv_render, uv_image: pixels [N, 2] of those that can be trusted.
+        looked_at: how many were looked for; of faint ones only those that were found, since
+            noise may hide them from an image that shows the same place.
     """
+
+    uv_render: Pixels
+    uv_image: Pixels
+    looked_at: int
+
+
+def follow_corners(
+    render: Gray, image: Gray, mask: NDArray[np.bool_], count: int, window: int, levels: int
+) -> Followed:
+    """At most `count` corners of a render inside a mask, followed into an image.
+
+    Where a render has few corners, as of a bare wall with a clock, faint ones are followed as
+    well; those must look alike in both.
+    """
+    uv_render, distinct = corners(render, mask, count)
+    uv_image, good = follow(render, image, uv_render, uv_render, window, levels)
+    if len(uv_render) > distinct:
+        alike = _correlation(render, image, uv_render[distinct:], uv_image[distinct:], window)
+        good[distinct:] &= alike > _MIN_FAINT_CORRELATION
+    looked_at = distinct + int(good[distinct:].sum())
+    return Followed(uv_render[good], uv_image[good], looked_at)
+
+
+def corners(gray: Gray, mask: NDArray[np.bool_], count: int) -> tuple[Pixels, int]:
+    """At most `count` pixels [N, 2] with texture inside a mask, spread over the image, and how
+    many of them, the first ones, have plenty: the others are there where those are few."""
     spacing = max(4.0, 0.6 * float(np.sqrt(gray.size / max(count, 1))))
     inside = mask.astype(np.uint8) * 255
-    for quality in (_QUALITY, _WEAK_QUALITY):
-        found = cv2.goodFeaturesToTrack(gray, count, quality, spacing, mask=inside, blockSize=5)
-        if found is not None and len(found) >= _ENOUGH * count:
-            break
-    return np.zeros((0, 2), np.float32) if found is None else found[:, 0].astype(np.float32)
+
+    def found(quality: float) -> Pixels:
+        uv = cv2.goodFeaturesToTrack(gray, count, quality, spacing, mask=inside, blockSize=5)
+        return np.zeros((0, 2), np.float32) if uv is None else uv[:, 0].astype(np.float32)
+
+    distinct = found(_QUALITY)
+    if len(distinct) >= _ENOUGH * count:
+        return distinct, len(distinct)
+    return found(_FAINT_QUALITY), len(distinct)  # the best first, so that those are among them
 
 
 def follow(
@@ -67,3 +102,24 @@ def _lucas_kanade(
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     return np.asarray(found[:, 0], np.float32), np.asarray(status[:, 0] == 1)
+
+
+def _correlation(
+    a: Gray, b: Gray, uv_a: Pixels, uv_b: Pixels, window: int
+) -> NDArray[np.float32]:
+    """Normalised cross-correlation [N] of patches around pixels of two images, -1 to 1."""
+    patches = []
+    for image, uv in ((a, uv_a), (b, uv_b)):
+        patch = _patches(image, uv, window)
+        patch -= patch.mean(axis=1, keepdims=True)
+        patches.append(patch / np.maximum(np.linalg.norm(patch, axis=1, keepdims=True), 1e-9))
+    return np.asarray((patches[0] * patches[1]).sum(axis=1))
+
+
+def _patches(image: Gray, uv: Pixels, window: int) -> NDArray[np.float32]:
+    """Bilinear samples [N, window * window] around pixels."""
+    offset = np.arange(window, dtype=np.float32) - window // 2
+    u = uv[:, :1] + np.tile(offset, window)
+    v = uv[:, 1:] + np.repeat(offset, window)
+    out = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(out, np.float32)

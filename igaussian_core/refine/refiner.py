@@ -18,7 +18,7 @@ from igaussian_core.lifting import at_pixels, sample, trusted_depth, unproject
 from igaussian_core.pnp import pose_covariance, reprojection_errors, solve_pnp
 from igaussian_core.query import Query
 from igaussian_core.refine.agreement import agreement, sharpness
-from igaussian_core.refine.alignment import corners, follow
+from igaussian_core.refine.alignment import follow, follow_corners
 from igaussian_core.refine.matchers import GuidedKeypoints, PairMatcher, make_pair_matcher
 from igaussian_core.refine.photometric import align_photometric
 from igaussian_core.refine.relative import solve_relative
@@ -171,11 +171,10 @@ class Refiner:
             gray = query.once("small", lambda: normalize_contrast(small.shrunk(query.image)))
             for _ in range(_APPROACH_ROUNDS):
                 view = self._seen(small, T_scene_cam)
-                uv_render = corners(view.gray, view.trusted, _APPROACH_POINTS)
-                uv_image, good = follow(
-                    view.gray, gray, uv_render, uv_render, _APPROACH_WINDOW, _APPROACH_LEVELS
-                )
-                uv_render, uv_image = uv_render[good], uv_image[good]
+                uv_render, uv_image, _ = follow_corners(
+                    view.gray, gray, view.trusted, _APPROACH_POINTS, _APPROACH_WINDOW,
+                    _APPROACH_LEVELS,
+                )  # fmt: skip
                 points = _lifted(view, small, T_scene_cam, uv_render)
                 solution = solve_pnp(
                     small, uv_image, points, self._config.max_reprojection_px, T_scene_cam
@@ -194,16 +193,12 @@ class Refiner:
             if view.coverage < _MIN_COVERAGE:
                 return Refinement(None, None, Evidence("align", coverage=view.coverage))
             with query.timer("align"):
-                uv_render = corners(view.gray, view.trusted, self._config.align_points)
-                uv_image, good = follow(
-                    view.gray, gray, uv_render, uv_render,
+                followed = follow_corners(
+                    view.gray, gray, view.trusted, self._config.align_points,
                     self._config.align_window, self._config.align_levels,
                 )  # fmt: skip
             with query.timer("solve"):
-                result = self._solve(
-                    query, view, T_scene_cam, "align", uv_render[good], uv_image[good],
-                    looked_at=len(uv_render),
-                )  # fmt: skip
+                result = self._solve(query, view, T_scene_cam, "align", *followed)
             if result.T_scene_cam is None:
                 return result
             step_px = _motion_px(query.camera, result.T_scene_cam, T_scene_cam, view.median_depth)

@@ -10,7 +10,7 @@ from igaussian_core.camera import Camera
 from igaussian_core.contrast import normalize_contrast
 from igaussian_core.features import Features
 from igaussian_core.query import Query
-from igaussian_core.refine.alignment import corners, follow
+from igaussian_core.refine.alignment import Followed, corners, follow, follow_corners
 from igaussian_core.timing import StageTimer
 
 
@@ -37,7 +37,7 @@ def tracked(
     a, b = normalize_contrast(render), normalize_contrast(image)
     mask = np.zeros(a.shape, bool)
     mask[30:-30, 30:-30] = True
-    uv = corners(a, mask, 200)
+    uv, _ = corners(a, mask, 200)
     found, good = follow(a, b, uv, uv + np.float32(guess), 15, levels)
     return (found - uv)[good], good.mean()
 
@@ -79,33 +79,60 @@ def test_corners_are_inside_the_mask_and_spread() -> None:
     gray = normalize_contrast(texture())
     mask = np.zeros(gray.shape, bool)
     mask[40:200, 100:300] = True
-    uv = corners(gray, mask, 100)
+    uv, _ = corners(gray, mask, 100)
     assert uv.dtype == np.float32 and 30 < len(uv) <= 100
     assert mask[uv[:, 1].astype(int), uv[:, 0].astype(int)].all()
     gaps = np.linalg.norm(uv[:, None] - uv[None], axis=2) + 1e3 * np.eye(len(uv))
     assert gaps.min() >= 4.0
 
 
-def test_a_bare_wall_counts_beside_a_clock() -> None:
-    """Its faint shades have corners enough to follow."""
-    shades = np.random.default_rng(0).uniform(-3, 3, (12, 16, 3))
+def bare_wall(seed: int) -> np.ndarray:
+    """Faint shades and one poster."""
+    shades = np.random.default_rng(seed).uniform(-3, 3, (12, 16, 3))
     image = 128 + cv2.resize(shades, (320, 240), interpolation=cv2.INTER_CUBIC)
     image = np.clip(image, 0, 255).astype(np.uint8)
     for row in range(92, 150, 14):
         cv2.putText(image, "XII", (130, row), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (20, 20, 20), 2)
-    uv = corners(normalize_contrast(image), np.ones((240, 320), bool), 200)
+    return image
+
+
+def followed(render: np.ndarray, image: np.ndarray) -> Followed:
+    everywhere = np.ones(render.shape[:2], bool)
+    a, b = normalize_contrast(render), normalize_contrast(image)
+    return follow_corners(a, b, everywhere, 200, 15, 2)
+
+
+def test_a_bare_wall_counts_beside_a_poster() -> None:
+    """Its faint shades are followed; those that are not found do not speak against the place."""
+    wall = bare_wall(0)
+    uv, distinct = corners(normalize_contrast(wall), np.ones((240, 320), bool), 200)
     away = np.linalg.norm(uv - [150, 120], axis=1) > 60
-    assert away.sum() > 60
+    assert 0 < distinct < 20 and not away[:distinct].any() and away.sum() > 60
+    same = followed(wall, moved(wall, 2.0, 1.0))
+    assert len(same.uv_render) > 60
+    motion = same.uv_image - same.uv_render
+    assert (np.linalg.norm(motion - [2, 1], axis=1) < 0.5).mean() > 0.8
+
+
+def test_noise_and_other_shades_are_not_taken_for_a_bare_wall() -> None:
+    wall = bare_wall(0)
+    noise = np.random.default_rng(1).normal(0, 6, wall.shape)
+    noisy = np.clip(wall + noise, 0, 255).astype(np.uint8)
+    for other in (noisy, bare_wall(1)):
+        found = followed(wall, other)
+        away = np.linalg.norm(found.uv_render - [150, 120], axis=1) > 60
+        assert away.sum() < 25 and found.looked_at < 60
+        assert found.looked_at >= len(found.uv_render)
 
 
 def test_nothing_to_follow() -> None:
     gray = normalize_contrast(texture())
-    none = corners(gray, np.zeros(gray.shape, bool), 50)
+    none, _ = corners(gray, np.zeros(gray.shape, bool), 50)
     assert none.shape == (0, 2)
     found, good = follow(gray, gray, none, none, 15, 2)
     assert found.shape == (0, 2) and good.shape == (0,)
     flat = normalize_contrast(np.full((240, 320, 3), 90, np.uint8))
-    assert len(corners(flat, np.ones(flat.shape, bool), 50)) == 0
+    assert len(corners(flat, np.ones(flat.shape, bool), 50)[0]) == 0
 
 
 def test_normalized_contrast() -> None:
