@@ -162,29 +162,33 @@ class Localizer:
         """Stage one: the prior, then what the network says, then places that the landmarks know;
         found as asked for.
 
-        In the cascade the network's places are only aligned at first: where that does not
-        convince, the landmarks cost less than matching descriptors at a wrong place. Those that
-        resemble the image come again, with descriptors, where the landmarks know none.
+        In the cascade the network's places, and those that few landmarks speak for, are only
+        aligned at first: matching descriptors at wrong places costs more than all else. Those
+        that resemble the image come again at last, with descriptors.
         """
         if prior is not None:
             if not is_rigid(prior):
                 raise CameraError("prior: expected a rigid 4x4 transform T_map_cam")
             yield Hypothesis(self._T_map_scene.inverse().camera(prior), 0.0, "prior")
-        method, network, asked = self._config.coarse.method, self._network, []
+        method, network = self._config.coarse.method, self._network
+        wanted, _ = thresholds(Evidence(self._matcher.name), self._config.verify)
+        unsure = []
         if network is not None:
             said = network.hypotheses(query.image, query.camera)
             for hypothesis in _timed_each(query, said):
-                asked.append(replace(hypothesis, align=False))
+                unsure.append(replace(hypothesis, align=False))
                 yield replace(hypothesis, describe=method == "network")
         if method != "network":
-            yield from _timed_each(
-                query, self._landmarks.hypotheses(query.features, query.camera)
-            )
+            known = self._landmarks.hypotheses(query.features, query.camera)
+            for hypothesis in _timed_each(query, known):
+                sure = method == "landmarks" or hypothesis.score >= wanted
+                if not sure:
+                    unsure.append(replace(hypothesis, align=False))
+                yield replace(hypothesis, describe=sure)
         if method == "cascade":
-            wanted, _ = thresholds(Evidence(self._matcher.name), self._config.verify)
             yield from most_alike(
-                query, asked, self._render_scene, self._matcher, self._config.features.keypoints,
-                wanted,
+                query, unsure, self._render_scene, self._matcher,
+                self._config.features.keypoints, wanted,
             )  # fmt: skip
 
     def _refine(

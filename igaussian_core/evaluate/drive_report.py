@@ -241,7 +241,7 @@ def _latency_figure(drive: Drive) -> Figure:
     )  # fmt: skip
     axes[0].set(ylabel="latency [ms]", ylim=(0, None))
     if accepted:
-        figure.legend(loc="outside upper center", fontsize=8, ncols=8, frameon=False)
+        figure.legend(loc="outside upper center", fontsize=8, ncols=6, frameon=False)
     axes[1].plot(
         [m.time_s for m in drive.memory], [m.rss_mb for m in drive.memory], color=BLUE
     )
