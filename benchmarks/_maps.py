@@ -8,6 +8,7 @@ from _data import data_folder
 
 from igaussian_core.compile_map import CompileOptions, compile_map
 from igaussian_core.map_package import MapPackage, NetworkData, open_package, read_tensors
+from igaussian_core.training.map_network import add_untrained_network
 
 ROOT = Path(__file__).resolve().parents[1]
 DEMO_ROOM = "demo room"
@@ -24,11 +25,12 @@ def map_sources(name: str) -> tuple[Path, Path]:
 
 
 def compiled_path(work: Path, name: str) -> Path:
-    """A compiled map in `work`; compiled there now where it is not yet."""
+    """A map in `work` as `igaussian map compile` makes it; compiled now where it is not yet."""
     target = work / f"{'room' if name == DEMO_ROOM else name}.igmap"
     if not target.is_dir():
         source, cameras = map_sources(name)
         compile_map(source, target, cameras, CompileOptions())
+        add_untrained_network(target)
     return target
 
 

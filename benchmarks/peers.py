@@ -1,12 +1,14 @@
 """The paper's tables and real photos, with other methods on the same queries and machine.
 
     python benchmarks/peers.py [--quick | --short] [--json out.json] [--work folder]
+                               [--only table] [--methods ours]
 
 Tables: the rendered track (layout of the paper's tables 1 and 3), pure rotation (table 2),
 photos, the ablation (table 4), the number of source views (figure 5). Methods are described in
 peer_methods.py; the slow one runs on fewer queries, which the table says. Finished runs are
-kept in --work, so that an interrupted benchmark goes on. Rows that need a stage which is not
-built yet say so. Needs the data folder (_data.py) and pycolmap (extra `bench`).
+kept in --work, so that an interrupted benchmark goes on. Rows that need a network which is not
+trained yet say so. With --methods only methods whose names contain that run, and the other rows of
+--json stay as they are. Needs the data folder (_data.py) and pycolmap (extra `bench`).
 """
 
 from __future__ import annotations
@@ -107,6 +109,7 @@ SOLVER = Config.from_flat(
     {**_UNLIMITED, "refine.solver": "paper", "refine.scale": "depth"}
 )
 SOLVER_VIT = Config.from_flat({**_UNLIMITED, "refine.solver": "paper", "refine.scale": "vit"})
+LANDMARKS = Config.from_flat({**_UNLIMITED, "coarse.method": "landmarks"})
 _HEADS = {**_UNLIMITED, "coarse.method": "network", "coarse.network_head": "attention",
           "coarse.network_renders": 0}  # fmt: skip
 HEADS = Config.from_flat(_HEADS)
@@ -144,10 +147,10 @@ ESSENTIAL_XFEAT = Method(
 
 
 def _descent(start: str) -> Callable[[Case], Estimator]:
-    return lambda c: GradientDescent(c.package, CONFIG, start, c.steps)
+    return lambda c: GradientDescent(c.package, LANDMARKS, start, c.steps)
 
 
-DESCENT_COARSE = Method("gradient descent from our stage one", _descent("coarse"), slow=True)
+DESCENT_COARSE = Method("gradient descent from the landmarks' pose", _descent("coarse"), slow=True)
 DESCENT_PRIOR = Method("gradient descent from the prior", _descent("prior"), slow=True)
 PAPERS_SOLVER = Method(
     "our stage one, the paper's solver (XFeat, RANSAC), scale by depth",
@@ -164,7 +167,9 @@ PEERS = (
 
 
 def _staged(refine: Callable[..., Any], **settings: Any) -> Callable[[Case], Estimator]:
-    config = Config.from_flat({**_UNLIMITED, **{f"refine.{k}": v for k, v in settings.items()}})
+    config = Config.from_flat(
+        {**LANDMARKS.to_flat(), **{f"refine.{k}": v for k, v in settings.items()}}
+    )
     return lambda c: Staged(c.package, config, refine)
 
 
@@ -178,7 +183,7 @@ ABLATION = (
     PAPERS_SOLVER_VIT,
     Method("ours: network with memory (stage one)",
            lambda c: CoarseOnly(_with_network(c, "memory"), CONFIG)),
-    Method("ours: landmarks alone (stage one)", lambda c: CoarseOnly(c.package, CONFIG)),
+    Method("ours: landmarks alone (stage one)", lambda c: CoarseOnly(c.package, LANDMARKS)),
     Method("ours: + matching and PnP, one round",
            _staged(lambda r, q, T: r.match(q, T), rounds=1)),
     Method("ours: + matching and PnP, two rounds", _staged(lambda r, q, T: r.match(q, T))),
@@ -201,6 +206,7 @@ class Scale:
     photos: int  # most photos a set
     slow_photos: int
     steps: int = 200  # of gradient descent
+    methods: str = ""  # part of the names of those that run
     references: int = 80  # most views that the peers are given
 
 
@@ -217,6 +223,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="few queries: does it run?")
     parser.add_argument("--only", help="one table: rendered, rotation, photos, ablation, views")
     parser.add_argument("--short", action="store_true", help="a fifth of the queries")
+    parser.add_argument("--methods", default="", help="part of the names of those that run")
     options = parser.parse_args()
     name = "quick" if options.quick else "short" if options.short else "full"
     scale, work = SCALES[name], options.work / name
@@ -225,19 +232,49 @@ def main() -> None:
         "rendered": _rendered_table, "rotation": _rotation_table, "photos": _photo_table,
         "ablation": _ablation_table, "views": _views_table,
     }  # fmt: skip
+    before = _report_before(options)
     report: dict[str, Any] = {"facts": {**machine_facts(), "commit": commit()}}
     report["facts"]["queries"] = (
         f"{scale.each} targets a bin ({scale.slow_each} for gradient descent), at most "
         f"{scale.photos} photos a set ({scale.slow_photos}), {scale.references} reference views"
     )
     report["facts"]["time limit of a frame"] = "none"
+    if before:
+        report["facts"]["rows of other methods"] = ", ".join(
+            f"{k}: {before['facts'][k]}" for k in ("date", "machine", "commit")
+        )
     for table, make in tables.items():
         if options.only in (None, table):
-            report[table] = make(work, scale)
+            rows = make(work, dataclasses.replace(scale, methods=options.methods))
+            report[table] = _merged(before.get(table, []), rows)
             print_table(table, report[table])
+        elif table in before:
+            report[table] = before[table]
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(report, indent=1) + "\n")
+
+
+def _report_before(options: argparse.Namespace) -> dict[str, Any]:
+    """What --json holds, where only some methods run."""
+    if not options.methods or not options.json or not options.json.is_file():
+        return {}
+    before: dict[str, Any] = json.loads(options.json.read_text())
+    return before
+
+
+def _merged(before: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows from before with those measured now in place of theirs, new ones at the
+    end."""
+    def key(row: dict[str, Any]) -> tuple[str, str]:
+        return row["case"], row["method"]
+
+    measured = {key(row): row for row in rows}
+    merged = []
+    for row in before:
+        now = measured.pop(key(row), row)
+        merged.append(row if "not_built" in now and "not_built" not in row else now)
+    return merged + list(measured.values())
 
 
 def commit() -> str:
@@ -304,7 +341,8 @@ def _rows(
     case: Case, methods: Sequence[Method], work: Path, table: str, scale: Scale
 ) -> list[dict[str, Any]]:
     rows = []
-    for method in track(methods, description=f"{table}: {case.name}"):
+    chosen = [method for method in methods if scale.methods in method.name]
+    for method in track(chosen, description=f"{table}: {case.name}"):
         row: dict[str, Any] = {"case": case.name, "method": method.name}
         try:
             outcomes = _outcomes(case, method, work, table, scale)
@@ -418,7 +456,7 @@ def _photo_case(name: str, work: Path, scale: Scale) -> Case:
 
 
 def _with_views(package: MapPackage, elevations_deg: tuple[float, ...]) -> MapPackage:
-    """The map with landmarks of spherical views only."""
+    """The map with landmarks of spherical views only, and no network, which has seen others."""
     sphere, camera = sphere_of(package), camera_of(package)
     poses = spherical_views(
         sphere.kind, sphere.radius, sphere.centre, sphere.up, elevations_deg=elevations_deg
@@ -428,7 +466,7 @@ def _with_views(package: MapPackage, elevations_deg: tuple[float, ...]) -> MapPa
         package.gaussians, sources, tuple(package.manifest.background), CONFIG,
         lambda stage, done, of: None,
     )  # fmt: skip
-    return dataclasses.replace(package, landmarks=landmarks)
+    return dataclasses.replace(package, landmarks=landmarks, network=None)
 
 
 # --- printing ---

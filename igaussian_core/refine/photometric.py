@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_CELL = 16  # pixels of a cell, of which each gives its steepest pixels
+_CELL = 16  # side of the largest blocks that give a pixel each
 _BORDER = 4  # pixels at the image's edge that are left out
 _MIN_GRADIENT = 1.5  # grey levels a pixel; flatter places tell noise
 _MIN_PIXELS = 200
@@ -182,21 +182,25 @@ def _level(
 def _steep(
     steepness: Image, trusted: Mask, pixels: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns of the steepest trusted pixels of each cell."""
+    """Rows and columns of the steepest trusted pixel of each block, blocks so small that where
+    there is texture they are at most `pixels`."""
     usable = np.zeros_like(steepness)
     inner = np.s_[_BORDER:-_BORDER, _BORDER:-_BORDER]
     usable[inner] = np.where(trusted[inner], steepness[inner], 0)
-    rows, columns = (size // _CELL for size in usable.shape)
-    if rows * columns == 0:
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    cells = usable[: rows * _CELL, : columns * _CELL].reshape(rows, _CELL, columns, _CELL)
-    cells = cells.transpose(0, 2, 1, 3).reshape(rows * columns, _CELL * _CELL)
-    full = np.flatnonzero(cells.max(axis=1) > _MIN_GRADIENT**2)
-    each = int(np.clip(pixels // max(len(full), 1), 1, _CELL * _CELL - 1))
-    inside = np.argpartition(cells[full], -each, axis=1)[:, -each:]
-    keep = np.take_along_axis(cells[full], inside, axis=1) > _MIN_GRADIENT**2
-    cell, inside = full[np.nonzero(keep)[0]], inside[keep]
-    return cell // columns * _CELL + inside // _CELL, cell % columns * _CELL + inside % _CELL
+    textured = (_blocks(usable, _CELL).max(axis=1, initial=0) > _MIN_GRADIENT**2).sum()
+    side = int(np.clip(np.ceil((textured * _CELL**2 / pixels) ** 0.5), 1, _CELL))
+    blocks = _blocks(usable, side)
+    inside = blocks.argmax(axis=1)
+    block = np.flatnonzero(blocks[np.arange(len(blocks)), inside] > _MIN_GRADIENT**2)
+    inside, columns = inside[block], usable.shape[1] // side
+    return block // columns * side + inside // side, block % columns * side + inside % side
+
+
+def _blocks(image: Image, side: int) -> Image:
+    """Pixels [blocks, side * side] of whole blocks, row by row."""
+    rows, columns = (size // side for size in image.shape)
+    cut = image[: rows * side, : columns * side].reshape(rows, side, columns, side)
+    return cut.transpose(0, 2, 1, 3).reshape(rows * columns, side * side)
 
 
 def _fitted(level: _Level, T: Array) -> _Fit | None:
