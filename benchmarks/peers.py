@@ -328,7 +328,7 @@ def _views_table(work: Path, scale: Scale) -> list[dict[str, Any]]:
     for count, elevations in VIEW_COUNTS.items():
         package = _with_views(whole, elevations)
         rendered = _rendered_case(f"lego, {count} views", package, scale)
-        photos = _photo_case("lego", work, scale)
+        photos = _photo_case("lego", work, dataclasses.replace(scale, photos=5 * scale.photos))
         case = dataclasses.replace(photos, name=f"lego photos, {count} views", package=package)
         for part in (rendered, case):
             rows += [

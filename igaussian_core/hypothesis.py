@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,8 @@ class Hypothesis:
         source: "prior", "landmarks", "network".
         align: whether stage two aligns here; not where it did so before in vain.
         describe: whether it may match descriptors where alignment does not convince.
-        rival: another place, 4x4, that explains nearly as much of the image; None: none known.
+        others: other places, 4x4, that the image may show as well, the likeliest first; looked
+            through once, and only where this one is accepted.
     """
 
     T_scene_cam: NDArray[np.float64]
@@ -26,4 +28,4 @@ class Hypothesis:
     source: str
     align: bool = True
     describe: bool = True
-    rival: NDArray[np.float64] | None = None
+    others: Iterable[NDArray[np.float64]] = ()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -31,6 +32,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 _SAME_PLACE = 0.1  # image widths between poses that are no rivals
+_ELSEWHERE = 0.5  # image widths beyond which a view is hardly one of the same place
+_VIEWS, _APPROACHED = 100, 8  # that are looked through for rivals
 
 
 class Localizer:
@@ -206,21 +209,45 @@ class Localizer:
     def _unless_ambiguous(
         self, query: Query, hypothesis: Hypothesis, found: Refinement, result: LocalizationResult
     ) -> LocalizationResult:
-        """An accepted pose; its rival where that convinces more, neither where both do alike."""
-        rival = hypothesis.rival
-        if rival is None or found.shift(query.camera, rival) < _SAME_PLACE:
-            return result
-        hypothesis = replace(hypothesis, T_scene_cam=rival)
-        other_found = self._refine(query, hypothesis, None)
-        other = self._result(hypothesis, other_found)
-        if not other.ok or other_found.T_scene_cam is None:
-            return result
-        if found.shift(query.camera, other_found.T_scene_cam) < _SAME_PLACE:
-            return result
-        weaker, stronger = sorted((result, other), key=lambda r: r.inliers)
-        if weaker.inliers < self._config.coarse.rival_share * stronger.inliers:
-            return stronger
-        return _ambiguous(stronger, weaker)
+        """An accepted pose; a rival where that convinces more, neither where both do alike."""
+        for rival in self._rivals(query, hypothesis, found):
+            tried = replace(hypothesis, T_scene_cam=rival, align=True)
+            other_found = self._refine(query, tried, None)
+            other = self._result(tried, other_found)
+            if not other.ok or other_found.T_scene_cam is None:
+                continue
+            if not self._apart(query, found, other_found.T_scene_cam, _SAME_PLACE):
+                continue
+            weaker, stronger = sorted((result, other), key=lambda r: r.inliers)
+            if weaker.inliers >= self._config.coarse.rival_share * stronger.inliers:
+                return _ambiguous(stronger, weaker)
+            if stronger is other:
+                return other
+        return result
+
+    def _rivals(
+        self, query: Query, hypothesis: Hypothesis, found: Refinement
+    ) -> Iterator[Array]:
+        """Places that are not on the way to an accepted one.
+
+        Of the network's, views that resemble the image: those nearby lead to the accepted place,
+        and so do most of the others, which one round of the approach tells.
+        """
+        if self._config.coarse.rival_share > 1:
+            return
+        if hypothesis.source != "network":
+            yield from (T for T in hypothesis.others if self._apart(query, found, T, _SAME_PLACE))
+            return
+        views = islice(hypothesis.others, _VIEWS)
+        far = (T for T in views if self._apart(query, found, T, _ELSEWHERE))
+        for T_scene_cam in islice(far, _APPROACHED):
+            nearer = self._refiner.approach(query, T_scene_cam, rounds=1)
+            if nearer is not None and self._apart(query, found, nearer, 0.5 * _ELSEWHERE):
+                yield nearer
+
+    @staticmethod
+    def _apart(query: Query, found: Refinement, T_scene_cam: Array, least: float) -> bool:
+        return found.shift(query.camera, T_scene_cam) >= least
 
     def _result(self, hypothesis: Hypothesis, refinement: Refinement) -> LocalizationResult:
         evidence = refinement.evidence

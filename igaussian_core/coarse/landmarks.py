@@ -39,7 +39,8 @@ class LandmarkLocalizer:
     def hypotheses(self, features: Features, camera: Camera) -> Iterator[Hypothesis]:
         """Poses in order of their inliers, at most `config.hypotheses`; found as asked for.
 
-        A place of which the next one has `config.rival_share` of the inliers has a rival.
+        Where the next place has `config.rival_share` of a place's inliers, the image may show
+        that as well.
 
         Args:
             features: the frame's, best score first.
@@ -52,7 +53,7 @@ class LandmarkLocalizer:
                 return
             following = next(places, None)
             if following and following.score >= self._config.rival_share * place.score:
-                place = replace(place, rival=following.T_scene_cam)
+                place = replace(place, others=(following.T_scene_cam,))
             yield place
             place = following
 

@@ -121,7 +121,7 @@ class NetworkLocalizer:
 
         Of the memory the regressed pose, then those of single views by falling similarity; of
         the attention the weighted mean, then candidates of single source views by falling
-        weight.
+        weight. Those that follow are the others that the image may show as well.
 
         Args:
             image: uint8 RGB [H, W, 3].
@@ -132,13 +132,14 @@ class NetworkLocalizer:
         answers = self._answers(small)
         first, score = next(answers)
         found.append(self._corrected(small, first) if self._renders else first)
-        yield Hypothesis(found[0], score, "network")
+        others = (T_scene_cam for T_scene_cam, _ in answers)
+        yield Hypothesis(found[0], score, "network", others=others)
         for T_scene_cam, score in answers:
             if len(found) >= self._count:
                 return
             if all(self._differs(T_scene_cam, other) for other in found):
                 found.append(T_scene_cam)
-                yield Hypothesis(T_scene_cam, score, "network")
+                yield Hypothesis(T_scene_cam, score, "network", others=others)
 
     def _corrected(self, small: Image, T_scene_cam: Array) -> Array:
         assert self._render is not None

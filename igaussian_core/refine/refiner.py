@@ -161,7 +161,9 @@ class Refiner:
         polished = self.align(query, matched.T_scene_cam)
         return polished if self._status(polished) is Status.OK else matched
 
-    def approach(self, query: Query, T_scene_cam: Array) -> Array | None:
+    def approach(
+        self, query: Query, T_scene_cam: Array, rounds: int = _APPROACH_ROUNDS
+    ) -> Array | None:
         """A hypothesis moved to where alignment finds on, by following points on small images;
         None where they do not agree."""
         small = query.camera.scaled_to_fit(self._config.approach_side)
@@ -169,7 +171,7 @@ class Refiner:
             return T_scene_cam
         with query.timer("approach"):
             gray = query.once("small", lambda: normalize_contrast(small.shrunk(query.image)))
-            for _ in range(_APPROACH_ROUNDS):
+            for _ in range(rounds):
                 view = self._seen(small, T_scene_cam)
                 uv_render, uv_image, _ = follow_corners(
                     view.gray, gray, view.trusted, _APPROACH_POINTS, _APPROACH_WINDOW,

@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 
 import make_docs  # noqa: E402
 import peer_methods as peers  # noqa: E402
+import peers as peers_command  # noqa: E402
 import tables  # noqa: E402
 
 METHODS = (peers.SfmSift, peers.EssentialMatrix, peers.GradientDescent, peers.CoarseOnly,
@@ -136,6 +137,17 @@ def test_the_page_of_benchmarks_is_current() -> None:
     """docs/benchmarks.md is what make_docs.py makes of benchmarks/results."""
     assert make_docs.PAGE.read_text() == make_docs.page(make_docs.RESULTS)
     assert {p.stem for p in make_docs.RESULTS.glob("*.json")} <= set(make_docs.SECTIONS)
+
+
+def test_measured_rows_take_the_place_of_their_own_alone() -> None:
+    before = [{"case": "a", "method": m, "summary": m} for m in ("ours", "other", "trained")]
+    now = [
+        {"case": "a", "method": "ours", "summary": "anew"},
+        {"case": "a", "method": "trained", "not_built": "no network"},
+        {"case": "b", "method": "ours", "summary": "new"},
+    ]
+    merged = peers_command._merged(before, now)
+    assert [row["summary"] for row in merged] == ["anew", "other", "trained", "new"]
 
 
 def test_rows_without_their_stage_say_so() -> None:
