@@ -132,8 +132,9 @@ class Refiner:
         that has the matches for it is then polished, and image and render are compared there.
 
         Args:
-            near: the hypothesis comes from the last frame: it is aligned at once, and
-                descriptors are compared only near where the render says the points should be.
+            near: the hypothesis comes from the last frame: it is aligned at once and approached
+                only where that finds little, and descriptors are compared only near where the
+                render says the points should be.
             prior: T_scene_cam where the camera was expected, whatever the hypothesis is.
             align: try alignment first.
             describe: match descriptors where alignment does not convince.
@@ -150,6 +151,10 @@ class Refiner:
         start = T_scene_cam if near or not align else self.approach(query, T_scene_cam)
         if align and start is not None:
             aligned = self.align(query, start)
+        if near and align and aligned.evidence.inliers < self._verify.min_inliers_align:
+            start = self.approach(query, T_scene_cam)  # the camera turned faster than expected
+            if start is not None:
+                aligned = self.align(query, start)
         if self._status(aligned) is Status.OK or not describe:
             return aligned
         began_ms = query.timer.elapsed_ms()

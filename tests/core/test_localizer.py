@@ -134,6 +134,17 @@ def test_a_place_too_far_off_to_align_to_is_approached(
         assert refiner.approach(query, T @ backwards) is None
 
 
+def test_a_prior_that_is_ten_degrees_off_is_approached(
+    localizer: Localizer, room_map: GaussianMap
+) -> None:
+    off = compose(rotation_from_vector([0.1, -0.14, 0.05]), [0.06, 0.05, -0.04])
+    for T in QUERIES[:4]:
+        result = localizer.localize(room.photo(room_map, T), room.CAMERA, T @ off)
+        assert_right(result, T)
+        assert result.source == "prior" and result.matcher == "align"
+        assert "extract" not in result.timings_ms  # descriptors would have been a last resort
+
+
 def test_the_prior_itself_is_never_the_answer(localizer: Localizer, room_map: GaussianMap) -> None:
     prior = QUERIES[0] @ NUDGE
     for image in (room.photo(room_map, QUERIES[0]), noise_image()):
