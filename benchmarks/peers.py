@@ -1,13 +1,13 @@
 """The paper's tables and real photos, with other methods on the same queries and machine.
 
     python benchmarks/peers.py [--quick | --short] [--json out.json] [--work folder]
-                               [--only table] [--methods ours]
+                               [--only table] [--methods ours,SfM]
 
 Tables: the rendered track (layout of the paper's tables 1 and 3), pure rotation (table 2),
 photos, the ablation (table 4), the number of source views (figure 5). Methods are described in
 peer_methods.py; the slow one runs on fewer queries, which the table says. Finished runs are
 kept in --work, so that an interrupted benchmark goes on. Rows that need a network which is not
-trained yet say so. With --methods only methods whose names contain that run, and the other rows of
+trained yet say so. With --methods only methods whose names contain one of those run, and the other rows of
 --json stay as they are. Needs the data folder (_data.py) and pycolmap (extra `bench`).
 """
 
@@ -206,7 +206,7 @@ class Scale:
     photos: int  # most photos a set
     slow_photos: int
     steps: int = 200  # of gradient descent
-    methods: str = ""  # part of the names of those that run
+    methods: str = ""  # parts of the names of those that run, between commas
     references: int = 80  # most views that the peers are given
 
 
@@ -223,7 +223,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="few queries: does it run?")
     parser.add_argument("--only", help="one table: rendered, rotation, photos, ablation, views")
     parser.add_argument("--short", action="store_true", help="a fifth of the queries")
-    parser.add_argument("--methods", default="", help="part of the names of those that run")
+    parser.add_argument("--methods", default="", help="parts of the names of those that run")
     options = parser.parse_args()
     name = "quick" if options.quick else "short" if options.short else "full"
     scale, work = SCALES[name], options.work / name
@@ -341,7 +341,8 @@ def _rows(
     case: Case, methods: Sequence[Method], work: Path, table: str, scale: Scale
 ) -> list[dict[str, Any]]:
     rows = []
-    chosen = [method for method in methods if scale.methods in method.name]
+    parts = scale.methods.split(",")
+    chosen = [method for method in methods if any(part in method.name for part in parts)]
     for method in track(chosen, description=f"{table}: {case.name}"):
         row: dict[str, Any] = {"case": case.name, "method": method.name}
         try:

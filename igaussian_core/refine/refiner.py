@@ -153,7 +153,7 @@ class Refiner:
             aligned = self.align(query, start)
         if near and align and aligned.evidence.inliers < self._verify.min_inliers_align:
             start = self.approach(query, T_scene_cam)  # the camera turned faster than expected
-            if start is not None:
+            if start is not None and start is not T_scene_cam:
                 aligned = self.align(query, start)
         if self._status(aligned) is Status.OK or not describe:
             return aligned
