@@ -7,8 +7,8 @@ Tables: the rendered track (layout of the paper's tables 1 and 3), pure rotation
 photos, the ablation (table 4), the number of source views (figure 5). Methods are described in
 peer_methods.py; the slow one runs on fewer queries, which the table says. Finished runs are
 kept in --work, so that an interrupted benchmark goes on. Rows that need a network which is not
-trained yet say so. With --methods only methods whose names contain one of those run, and the other rows of
---json stay as they are. Needs the data folder (_data.py) and pycolmap (extra `bench`).
+trained yet say so. With --methods only methods whose names contain one of those run, and the other
+rows of --json stay as they are. Needs the data folder (_data.py) and pycolmap (extra `bench`).
 """
 
 from __future__ import annotations
