@@ -203,8 +203,9 @@ class RuntimeConfig:
 
     threads: int = _option(2, "threads of networks and renderer", 1, 256)
     budget_ms: float = _option(
-        1000.0, "milliseconds of a frame after which no further hypothesis is tried", 1, 60000
-    )
+        1000.0, "milliseconds of a frame after which no further hypothesis is tried; a frame with "
+        "a prior matches descriptors elsewhere only within half of them", 1, 60000
+    )  # fmt: skip
     max_image_age_s: float = _option(
         1.0, "frames older than this when work starts are dropped", 0, 60
     )

@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 _SAME_PLACE = 0.1  # image widths between poses that are no rivals
+_TRACKS_SHARE = 0.5  # of the time limit, for a frame that has a prior
 _ELSEWHERE = 0.5  # image widths beyond which a view is hardly one of the same place
 _VIEWS, _APPROACHED = 100, 8  # that are looked through for rivals
 
@@ -106,17 +107,15 @@ class Localizer:
         failure = LocalizationResult(
             Status.NO_HYPOTHESIS, "no place in the map resembles the image", source="landmarks"
         )
-        budget_ms = self._config.runtime.budget_ms
+        budget_ms = limit_ms = self._config.runtime.budget_ms
         over = False
         for hypothesis in self._hypotheses(query, prior):
             if over:
-                failure = _out_of_time(failure, budget_ms)
+                failure = _out_of_time(failure, limit_ms)
                 break
-            # the next frame of a track is worth more than the last place of this one
             late = (
-                prior is not None and hypothesis.source != "prior" and hypothesis.describe
-                and timer.elapsed_ms() + self._refiner.match_ms > budget_ms
-            )  # fmt: skip
+                hypothesis.source != "prior" and hypothesis.describe and self._late(query, prior)
+            )
             tried = replace(hypothesis, describe=False) if late else hypothesis
             refinement = self._refine(query, tried, prior)
             result = self._result(hypothesis, refinement)
@@ -127,8 +126,9 @@ class Localizer:
             if result.inliers >= failure.inliers:
                 failure = result
             over = late or timer.elapsed_ms() > budget_ms
+            limit_ms = _TRACKS_SHARE * budget_ms if late else budget_ms
             if over and hypothesis.source != "landmarks":  # whose search would take longer still
-                failure = _out_of_time(failure, budget_ms)
+                failure = _out_of_time(failure, limit_ms)
                 break
         return _timed(failure, timer)
 
@@ -188,11 +188,19 @@ class Localizer:
                 if not sure:
                     unsure.append(replace(hypothesis, align=False))
                 yield replace(hypothesis, describe=sure)
-        if method == "cascade":
+        if method == "cascade" and self._late(query, prior):
+            yield from unsure
+        elif method == "cascade":
             yield from most_alike(
                 query, unsure, self._render_scene, self._matcher,
                 self._config.features.keypoints, wanted,
             )  # fmt: skip
+
+    def _late(self, query: Query, prior: ArrayLike | None) -> bool:
+        """Whether matching descriptors would end so late that a track's next frame, which is
+        worth more than the last place of this one, waits for it."""
+        end_ms = query.timer.elapsed_ms() + self._refiner.match_ms
+        return prior is not None and end_ms > _TRACKS_SHARE * self._config.runtime.budget_ms
 
     def _refine(
         self, query: Query, hypothesis: Hypothesis, prior: ArrayLike | None
