@@ -28,10 +28,16 @@ def compiled_path(work: Path, name: str) -> Path:
     """A map in `work` as `igaussian map compile` makes it; compiled now where it is not yet."""
     target = work / f"{'room' if name == DEMO_ROOM else name}.igmap"
     if not target.is_dir():
-        source, cameras = map_sources(name)
-        compile_map(source, target, cameras, CompileOptions())
-        add_untrained_network(target)
+        compile_as_users_do(target, *map_sources(name))
     return target
+
+
+def compile_as_users_do(
+    target: Path, source: Path, cameras: Path | None, kind: str | None = None
+) -> None:
+    """As `igaussian map compile` does, with an untrained network."""
+    compile_map(source, target, cameras, CompileOptions(kind=kind))
+    add_untrained_network(target)
 
 
 def compiled(work: Path, name: str) -> MapPackage:

@@ -24,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 from _data import data_folder
+from _maps import DEMO_ROOM, compiled_path
 from numpy.typing import NDArray
 from photos import CASES, compiled
 
@@ -31,7 +32,7 @@ from igaussian_core.bags import Bag
 from igaussian_core.calibrate import MIN_POSES, covariance_scale
 from igaussian_core.camera import Camera
 from igaussian_core.cli_tools import load_config
-from igaussian_core.compile_map import compile_map, training_images
+from igaussian_core.compile_map import training_images
 from igaussian_core.config import Config
 from igaussian_core.evaluate.drive import Trajectory
 from igaussian_core.evaluate.metrics import (
@@ -173,9 +174,7 @@ def _drive(work: Path | None, config: Config) -> Array:
     """NEES of every frame of the bundled drive, tracked."""
     demo = Path(__file__).resolve().parents[1] / "bags" / "demo"
     with tempfile.TemporaryDirectory() as temporary:
-        target = (work or Path(temporary)) / "room.igmap"
-        if not target.is_dir():
-            compile_map(demo / "room.ply", target, demo / "mapping_cameras.json")
+        target = compiled_path(work or Path(temporary), DEMO_ROOM)
         tracker, found = Tracker(Localizer.open(target, config), config), []
         with Bag(demo / "drive") as bag:
             truth = Trajectory(bag.poses())

@@ -264,8 +264,8 @@ def _report_before(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _merged(before: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows from before with those measured now in place of theirs, new ones at the
-    end."""
+    """Rows from before, those measured now in place of theirs, and new ones."""
+
     def key(row: dict[str, Any]) -> tuple[str, str]:
         return row["case"], row["method"]
 

@@ -16,15 +16,15 @@ import tempfile
 from pathlib import Path
 
 from _data import data_folder
+from _maps import compile_as_users_do
 
-from igaussian_core.compile_map import CompileOptions, compile_map, training_images
+from igaussian_core.compile_map import training_images
 from igaussian_core.evaluate.metrics import QueryOutcome, summarize, to_json
 from igaussian_core.evaluate.photos import PhotoQueries, extent, held_out_images
 from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.evaluate.runner import run
 from igaussian_core.localizer import Localizer
 from igaussian_core.posed_images import PosedImage, read_posed_images
-from igaussian_core.training.map_network import add_untrained_network
 
 # name, set, training cameras given, kind, queries whose name starts so
 CASES = (
@@ -127,8 +127,7 @@ def compiled(
     target = work / f"{name.replace(', ', '_').replace(' ', '_')}.igmap"
     if not target.is_dir():
         cameras = folder / "poses.json" if with_cameras else None
-        compile_map(folder / "map.ply", target, cameras, CompileOptions(kind=kind))
-        add_untrained_network(target)
+        compile_as_users_do(target, folder / "map.ply", cameras, kind)
     return target
 
 

@@ -13,6 +13,13 @@ _SHRINK = 4  # mean and deviation are smooth: a quarter of the resolution tells 
 _NOISE = 4.0  # grey levels of contrast below which nothing is amplified
 
 
+def blocks(image: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """Pixels [blocks, side * side] of an image's whole square blocks, row by row."""
+    rows, columns = (size // side for size in image.shape)
+    whole = image[: rows * side, : columns * side].reshape(rows, side, columns, side)
+    return np.asarray(whole.transpose(0, 2, 1, 3).reshape(rows * columns, side * side))
+
+
 def normalize_contrast(image: NDArray[np.uint8]) -> Gray:
     """Grey image [H, W] of uint8 RGB [H, W, 3] with local mean 128 and local deviation 40."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)

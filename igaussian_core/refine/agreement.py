@@ -11,11 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from igaussian_core.contrast import Gray
+from igaussian_core.contrast import Gray, blocks
 
 Mask = NDArray[np.bool_]
 Pixels = NDArray[np.float32]
-Cells = NDArray[np.float32]
 
 CELL_PX = 24
 _SHRINK = 4  # a pose that is right to a pixel or two changes nothing
@@ -38,7 +37,10 @@ def agreement(image: Gray, render: Gray, known: Mask, uv: Pixels) -> float:
     Returns:
         NaN where fewer than 4 such cells have texture: nothing can be said.
     """
-    a, b, m = (_cells(_small(array)) for array in (image, render, known.astype(np.uint8) * 255))
+    a, b, m = (
+        blocks(_small(array), CELL_PX // _SHRINK)
+        for array in (image, render, known.astype(np.uint8) * 255)
+    )
     m = (m > 127).astype(np.float32)
     count = np.maximum(m.sum(axis=1), 1e-9)
     a = (a - ((a * m).sum(axis=1) / count)[:, None]) * m
@@ -71,7 +73,7 @@ def sharpness(image: Gray, render: Gray, known: Mask, uv: Pixels) -> float:
     half = (max(width // 2, 1), max(height // 2, 1))
     inside = cv2.resize(known.astype(np.float32), half, interpolation=cv2.INTER_AREA)
     a, b = (_detail(array, half) * inside for array in (image, render))
-    cells_a, cells_b = (_cells(x, CELL_PX // 2)[occupied] for x in (a, b))
+    cells_a, cells_b = (blocks(x, CELL_PX // 2)[occupied] for x in (a, b))
     energy = float((cells_b * cells_b).sum())
     return float((cells_a * cells_b).sum()) / energy if energy > 0 else float("nan")
 
@@ -92,13 +94,6 @@ def _small(array: Gray) -> NDArray[np.float32]:
 def _grid(shape: tuple[int, ...]) -> tuple[int, int]:
     """Rows and columns of whole cells."""
     return shape[0] // CELL_PX, shape[1] // CELL_PX
-
-
-def _cells(array: NDArray[np.float32], side: int = CELL_PX // _SHRINK) -> Cells:
-    """Pixels [cells, side * side] by cell, row by row."""
-    rows, columns = array.shape[0] // side, array.shape[1] // side
-    blocks = array[: rows * side, : columns * side].reshape(rows, side, columns, side)
-    return np.asarray(blocks.transpose(0, 2, 1, 3).reshape(rows * columns, side * side))
 
 
 def _occupied(shape: tuple[int, ...], uv: Pixels) -> Mask:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igaussian_core.camera import Camera
+from igaussian_core.contrast import blocks
 from igaussian_core.geometry import compose, inverse, rotation_from_vector, vector_from_rotation
 from igaussian_core.lifting import unproject
 
@@ -187,20 +188,13 @@ def _steep(
     usable = np.zeros_like(steepness)
     inner = np.s_[_BORDER:-_BORDER, _BORDER:-_BORDER]
     usable[inner] = np.where(trusted[inner], steepness[inner], 0)
-    textured = (_blocks(usable, _CELL).max(axis=1, initial=0) > _MIN_GRADIENT**2).sum()
+    textured = (blocks(usable, _CELL).max(axis=1, initial=0) > _MIN_GRADIENT**2).sum()
     side = int(np.clip(np.ceil((textured * _CELL**2 / pixels) ** 0.5), 1, _CELL))
-    blocks = _blocks(usable, side)
-    inside = blocks.argmax(axis=1)
-    block = np.flatnonzero(blocks[np.arange(len(blocks)), inside] > _MIN_GRADIENT**2)
+    cells = blocks(usable, side)
+    inside = cells.argmax(axis=1)
+    block = np.flatnonzero(cells[np.arange(len(cells)), inside] > _MIN_GRADIENT**2)
     inside, columns = inside[block], usable.shape[1] // side
     return block // columns * side + inside // side, block % columns * side + inside % side
-
-
-def _blocks(image: Image, side: int) -> Image:
-    """Pixels [blocks, side * side] of whole blocks, row by row."""
-    rows, columns = (size // side for size in image.shape)
-    cut = image[: rows * side, : columns * side].reshape(rows, side, columns, side)
-    return cut.transpose(0, 2, 1, 3).reshape(rows * columns, side * side)
 
 
 def _fitted(level: _Level, T: Array) -> _Fit | None:
