@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import hashlib
 import json
 import time
 from pathlib import Path
@@ -30,7 +31,7 @@ from peers import commit
 from safetensors.numpy import save_file
 
 from igaussian_core.coarse.attention import PAPER, PLAIN, NetworkConfig, PoseNetwork
-from igaussian_core.coarse.network import load_checkpoint, shipped_checkpoint
+from igaussian_core.coarse.network import MapNetwork, load_checkpoint, shipped_checkpoint
 from igaussian_core.compile_map import training_images
 from igaussian_core.config import Config
 from igaussian_core.evaluate.coarse_estimator import CoarseOnly
@@ -44,13 +45,17 @@ from igaussian_core.map_package import MapPackage, NetworkData, read_tensors
 from igaussian_core.sphere import sphere_of
 from igaussian_core.training.episodes import EpisodeOptions
 from igaussian_core.training.map_network import (
+    BANK,
     FOR_HEADS,
     FOR_HEADS_FROM_WEIGHTS,
     FOR_MEMORY,
     MEMORY,
+    setting_of,
     train_map_network,
+    train_on,
+    training_map,
 )
-from igaussian_core.training.pose_network import TrainOptions
+from igaussian_core.training.pose_network import TrainingMap, TrainOptions
 
 MAPS = ("lego", DEMO_ROOM, "redkitchen", "fox", "flower")
 VIEW_COUNTS = (8, 12, 16, 20)
@@ -118,31 +123,42 @@ def maps_table(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def ablation_table(options: argparse.Namespace) -> list[dict[str, Any]]:
-    parts = [
-        (label, config, sources, f"ablation-{index}")
-        for index, (label, (config, sources)) in enumerate(ABLATION.items())
-    ]
-    return _short_trainings(parts, options)
+    return _short_trainings(
+        [(label, config, sources) for label, (config, sources) in ABLATION.items()], options
+    )
 
 
 def views_table(options: argparse.Namespace) -> list[dict[str, Any]]:
-    parts = [(f"{n} source views", NetworkConfig(), n, f"views-{n}") for n in VIEW_COUNTS]
+    parts = [(f"{n} source views", NetworkConfig(), n) for n in VIEW_COUNTS]
     return _short_trainings(parts, options)
 
 
 def _short_trainings(
-    parts: list[tuple[str, NetworkConfig, int, str]], options: argparse.Namespace
+    parts: list[tuple[str, NetworkConfig, int]], options: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    """Of lego, each of a label, what the network is made of, source views, name of a file."""
+    """Of lego, each of a label, what the network is made of, and so many source views.
+
+    All learn from the same views, rendered once and not renewed.
+    """
     package, rows = compiled(options.work, "lego"), []
-    for label, config, sources, file in parts:
-        torch.manual_seed(0)
-        trained = _trained(
-            package, PoseNetwork(config), dataclasses.replace(FOR_HEADS, steps=options.short_steps),
-            sources, SHORT_MEMORY,
-            options.work / f"{file}-{options.short_steps}.safetensors", options.threads,
-        )  # fmt: skip
-        rows += _judged(package, "lego", label, trained, options)
+    steps = dataclasses.replace(FOR_HEADS, steps=options.short_steps, refresh=0)
+    views: TrainingMap | None = None
+    for label, config, sources in parts:
+        made_of = hashlib.sha256(repr((config, sources, steps)).encode()).hexdigest()[:8]
+        file = options.work / f"short-{made_of}.safetensors"
+        if not file.is_file():
+            setting = setting_of(package, sources, options.threads)
+            if views is None:
+                views = training_map("lego", setting, BANK, steps.seed)
+            shown, _ = setting.renderer.render(setting.source_poses)
+            torch.manual_seed(0)
+            began = time.perf_counter()
+            trained, _ = train_on(
+                views._replace(sources=shown), setting, PoseNetwork(config), steps, SHORT_MEMORY,
+                options.threads,
+            )  # fmt: skip
+            _keep(trained, file, time.perf_counter() - began, steps.steps)
+        rows += _judged(package, "lego", label, read_tensors(file), options)
     return rows
 
 
@@ -156,10 +172,14 @@ def _trained(
         trained, _ = train_map_network(
             package, start, options, sources=sources, memory=memory, threads=threads,
         )  # fmt: skip
-        data = trained.data()
-        facts = {"seconds": str(time.perf_counter() - began), "steps": str(options.steps)}
-        save_file(data.tensors, str(file), {**data.meta, **facts})
+        _keep(trained, file, time.perf_counter() - began, options.steps)
     return read_tensors(file)
+
+
+def _keep(trained: MapNetwork, file: Path, seconds: float, steps: int) -> None:
+    data = trained.data()
+    facts = {"seconds": str(seconds), "steps": str(steps)}
+    save_file(data.tensors, str(file), {**data.meta, **facts})
 
 
 def _judged(

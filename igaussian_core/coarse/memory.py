@@ -62,11 +62,6 @@ class ViewMemory(NamedTuple):
     mean: Tensor
     coefficients: Tensor
 
-    def similarity(self, features: Tensor) -> Tensor:
-        """Kernel values [B, N] in [0, 1] of the backbone's features [B, C, h, w]."""
-        queries = (raw_keys(features) - self.centre) @ self.basis
-        return matern(torch.cdist(queries, self.keys.float()), self.width)
-
     def regressed(self, similarity: Tensor) -> tuple[Array, Array]:
         """Rotations [B, 3, 3] and positions [B, 3], normalised units, of kernel values [B, N]."""
         return _as_poses(similarity @ self.coefficients + self.mean)
@@ -91,23 +86,39 @@ class Recalled(NamedTuple):
     similarity: Tensor
 
 
-@torch.inference_mode()
-def recall(
-    memory: ViewMemory, backbone: nn.Module, image: NDArray[np.uint8], camera: Camera
-) -> Recalled:
-    """The pose of an image.
+class Recall:
+    """Asks a memory for the poses of images.
 
     Args:
-        image: uint8 RGB of the canonical camera.
-        camera: that one.
+        memory: of one map.
+        backbone: whose features its keys are of.
+        camera: the canonical camera of images.
     """
-    turns = [rotation_from_vector(np.radians(angles)) for angles in _TURNS_DEG]
-    seen = np.stack([image, *(turned(image, camera, turn) for turn in turns[1:])])
-    similarity = memory.similarity(backbone(to_tensor(seen)))
-    rotations, positions = memory.regressed(similarity)
-    rotations = rotations @ np.array(turns).transpose(0, 2, 1)
-    kept = _agreeing(rotations, positions)
-    return Recalled(mean_rotation(rotations[kept]), positions[kept].mean(0), similarity[0])
+
+    def __init__(self, memory: ViewMemory, backbone: nn.Module, camera: Camera) -> None:
+        self.memory, self._backbone, self._camera = memory, backbone, camera
+        # widened and squared once: cdist would copy all keys for every image
+        self._keys = memory.keys.float()
+        self._squared = self._keys.square().sum(1)
+        self._turns = np.array([rotation_from_vector(np.radians(a)) for a in _TURNS_DEG])
+
+    @torch.inference_mode()
+    def __call__(self, image: NDArray[np.uint8]) -> Recalled:
+        """The pose of an image: uint8 RGB of the canonical camera."""
+        looks = [turned(image, self._camera, turn) for turn in self._turns[1:]]
+        similarity = self.similarity(self._backbone(to_tensor(np.stack([image, *looks]))))
+        rotations, positions = self.memory.regressed(similarity)
+        rotations = rotations @ self._turns.transpose(0, 2, 1)
+        kept = _agreeing(rotations, positions)
+        return Recalled(mean_rotation(rotations[kept]), positions[kept].mean(0), similarity[0])
+
+    def similarity(self, features: Tensor) -> Tensor:
+        """Kernel values [B, N] in [0, 1] of the backbone's features [B, C, h, w]."""
+        memory = self.memory
+        queries = (raw_keys(features) - memory.centre) @ memory.basis
+        squared = queries.square().sum(1, keepdim=True) + self._squared
+        squared.addmm_(queries, self._keys.T, alpha=-2)
+        return matern(squared.clamp_(min=0).sqrt_(), memory.width)
 
 
 def _agreeing(rotations: Array, positions: Array) -> NDArray[np.bool_]:

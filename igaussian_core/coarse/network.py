@@ -19,7 +19,7 @@ from igaussian_core.camera import Camera
 from igaussian_core.coarse.attention import NetworkConfig, PoseNetwork, SourceViews
 from igaussian_core.coarse.canonical import cell_rays, resampled, to_tensor
 from igaussian_core.coarse.look_back import Render, looked_back
-from igaussian_core.coarse.memory import GRID, ViewMemory, recall
+from igaussian_core.coarse.memory import GRID, Recall, ViewMemory
 from igaussian_core.coarse.pose_scale import PoseScale
 from igaussian_core.errors import MapError
 from igaussian_core.geometry import compose, mean_rotation, pose_error
@@ -111,9 +111,9 @@ class NetworkLocalizer:
         self._trained = trained
         self._count = hypotheses
         self._render, self._renders = render, renders if render else 0
-        self._memory = trained.memory if head == "memory" else None
-        if self._memory is not None:  # widened once, not for every frame
-            self._memory = self._memory._replace(keys=self._memory.keys.float())
+        self._recall: Recall | None = None
+        if head == "memory" and trained.memory is not None:
+            self._recall = Recall(trained.memory, trained.network.backbone, trained.camera)
         self._rays = cell_rays(trained.camera)[None]
 
     def hypotheses(self, image: Image, camera: Camera) -> Iterator[Hypothesis]:
@@ -151,18 +151,17 @@ class NetworkLocalizer:
 
     def _answers(self, small: Image) -> Iterator[tuple[Array, float]]:
         """Poses T_scene_cam and scores of an image of the canonical camera."""
-        found = self._attended(small) if self._memory is None else self._remembered(small)
+        found = self._attended(small) if self._recall is None else self._remembered(small)
         for rotation, position, score in found:
             yield compose(rotation, self._trained.scale.scene(position)), score
 
     def _remembered(self, image: Image) -> Iterator[tuple[Array, Array, float]]:
-        assert self._memory is not None
-        backbone, camera = self._trained.network.backbone, self._trained.camera
-        recalled = recall(self._memory, backbone, image, camera)
+        assert self._recall is not None
+        recalled = self._recall(image)
         yield recalled.rotation, recalled.position, 1.0
         score, order = recalled.similarity.sort(descending=True, stable=True)
         for value, index in zip(score.tolist(), order.tolist(), strict=True):
-            yield *self._memory.pose_of(index), value
+            yield *self._recall.memory.pose_of(index), value
 
     def _attended(self, image: Image) -> Iterator[tuple[Array, Array, float]]:
         with torch.inference_mode():

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from igaussian_core.camera import Camera
 from igaussian_core.coarse.attention import PoseNetwork
 from igaussian_core.coarse.canonical import OVERSAMPLING, canonical_camera, cell_rays
-from igaussian_core.coarse.memory import ViewMemory, fit_memory, raw_keys, recall
+from igaussian_core.coarse.memory import Recall, ViewMemory, fit_memory, raw_keys
 from igaussian_core.coarse.network import MapNetwork, load_checkpoint, shipped_checkpoint
 from igaussian_core.coarse.pose_scale import PoseScale
 from igaussian_core.map_package import MapPackage, open_package, with_network
@@ -148,13 +148,22 @@ def train_map_network(
     Raises:
         MapError: the map shows next to nothing from where views are drawn.
     """
-    torch.manual_seed(options.seed)
-    torch.set_num_threads(threads)
     setting = setting_of(package, sources, threads)
     count = MEMORY if memory is None else memory
     if bank is None:
         bank = count if isinstance(options, EpisodeOptions) else BANK
     data = training_map(package.manifest.name, setting, bank, options.seed, progress)
+    return train_on(data, setting, start, options, count, threads, checkpoint, progress)
+
+
+def train_on(
+    data: TrainingMap, setting: Setting, start: PoseNetwork,
+    options: EpisodeOptions | TrainOptions, memory: int, threads: int = 2,
+    checkpoint: Path | None = None, progress: Progress = lambda stage, done, of: None,
+) -> tuple[MapNetwork, Curve]:  # fmt: skip
+    """As `train_map_network`, on views that are there already."""
+    torch.manual_seed(options.seed)
+    torch.set_num_threads(threads)
     trainer: Trainer
     if isinstance(options, EpisodeOptions):
         views = EpisodeMap(data.bank.views, data.background, data.lambda_t)
@@ -162,7 +171,7 @@ def train_map_network(
     else:
         trainer = MapTrainer(start, data, options, checkpoint, threads)
     curve = trainer.run(progress)
-    remembered = remember(trainer.network, data, setting, count, options.seed, progress)
+    remembered = remember(trainer.network, data, setting, memory, options.seed, progress)
     return trained_network(trainer.network, data, setting, options, remembered), curve
 
 
@@ -231,9 +240,8 @@ def remembered_errors(
     """As `held_out_errors`, of the memory's regression."""
     held_out = data.held_out
     images = (composite(held_out.rgba, data.background[None]) * 255).round().clamp(0, 255)
-    found = [
-        recall(memory, network.backbone, image, camera) for image in images.byte().numpy()
-    ]
+    recall = Recall(memory, network.backbone, camera)
+    found = [recall(image) for image in images.byte().numpy()]
     rotations = torch.from_numpy(np.array([f.rotation for f in found])).float()
     positions = torch.from_numpy(np.array([f.position for f in found])).float()
     degrees = rotation_error_deg(rotations, held_out.rotation)

@@ -126,14 +126,16 @@ class Trainer(ABC):
                                initargs=(1,)) as workers,
         ):  # fmt: skip
             pending = beside.submit(lambda: None)
+            losses: list[float] = []  # since the last validation
             while self.step < plan.steps:
                 pending.result()
                 shares = self._draw()
                 pending = beside.submit(self._renew)
-                loss = self._learn(shares, workers)
+                losses.append(self._learn(shares, workers))
                 self.step += 1
                 if self.step % plan.validate_every == 0 or self.step == plan.steps:
-                    self._note(loss)
+                    self._note(float(np.mean(losses)))
+                    losses.clear()
                 if self._checkpoint is not None and self.step % self.save_every == 0:
                     self._save(self._checkpoint)
                 progress("training", self.step, plan.steps)

@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from igaussian_core.camera import Camera
-from igaussian_core.coarse.memory import ViewMemory, _agreeing, fit_memory, raw_keys, recall
+from igaussian_core.coarse.memory import Recall, ViewMemory, _agreeing, fit_memory, raw_keys
 from igaussian_core.errors import MapError
 from igaussian_core.geometry import is_rigid, rotation_from_vector
+
+CAMERA = Camera(32, 32, 40.0, 40.0, 15.5, 15.5)
 
 
 def views(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -23,6 +25,10 @@ def views(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tens
     return features, torch.tensor(rotations).float(), torch.tensor(positions).float()
 
 
+def similarity_to(memory: ViewMemory, features: torch.Tensor) -> torch.Tensor:
+    return Recall(memory, torch.nn.Identity(), CAMERA).similarity(features)
+
+
 @pytest.fixture(scope="module")
 def memory() -> ViewMemory:
     features, rotations, positions = views(1500, 0)
@@ -31,7 +37,7 @@ def memory() -> ViewMemory:
 
 def test_poses_of_views_that_it_never_saw(memory: ViewMemory) -> None:
     features, rotations, positions = views(100, 1)
-    found_rotations, found_positions = memory.regressed(memory.similarity(features))
+    found_rotations, found_positions = memory.regressed(similarity_to(memory, features))
     assert np.median(np.linalg.norm(found_positions - positions.numpy(), axis=1)) < 0.05
     cosine = np.einsum("nij,nij->n", found_rotations, rotations.numpy())
     assert np.degrees(np.arccos(np.clip((np.median(cosine) - 1) / 2, -1, 1))) < 3
@@ -43,7 +49,7 @@ def test_poses_of_views_that_it_never_saw(memory: ViewMemory) -> None:
 
 def test_it_knows_the_views_that_it_keeps(memory: ViewMemory) -> None:
     features, rotations, positions = views(1500, 0)
-    similarity = memory.similarity(features[:50])
+    similarity = similarity_to(memory, features[:50])
     assert (similarity.argmax(1) == torch.arange(50)).all()
     assert similarity.min() >= 0 and similarity.max() <= 1 + 1e-5
     rotation, position = memory.pose_of(7)
@@ -52,7 +58,7 @@ def test_it_knows_the_views_that_it_keeps(memory: ViewMemory) -> None:
 
 
 def test_what_resembles_nothing_gets_a_pose_all_the_same(memory: ViewMemory) -> None:
-    similarity = memory.similarity(1e3 * torch.ones(1, 40, 4, 4))
+    similarity = similarity_to(memory, 1e3 * torch.ones(1, 40, 4, 4))
     rotations, positions = memory.regressed(similarity)
     assert similarity.max() < 1e-3
     assert is_rigid(np.block([[rotations[0], positions[0][:, None]], [np.zeros((1, 3)), 1]]))
@@ -71,8 +77,7 @@ def test_answers_of_turned_images_are_turned_back_and_averaged() -> None:
     keys = raw_keys(Tint()(colours[:, :, None, None].expand(-1, -1, 8, 8)))
     memory = fit_memory(keys, torch.eye(3).expand(400, 3, 3), colours, 8)
     image = np.full((32, 32, 3), (51, 102, 153), np.uint8)
-    camera = Camera(32, 32, 40.0, 40.0, 15.5, 15.5)
-    recalled = recall(memory, Tint(), image, camera)
+    recalled = Recall(memory, Tint(), CAMERA)(image)
     assert np.allclose(recalled.position, [0.2, 0.4, 0.6], atol=0.03)
     assert np.degrees(np.arccos((np.trace(recalled.rotation) - 1) / 2)) < 1.0
     assert recalled.similarity.shape == (400,)
@@ -90,7 +95,7 @@ def test_views_all_alike() -> None:
     same = torch.ones(20, 40)
     rotations = torch.eye(3).expand(20, 3, 3)
     memory = fit_memory(same, rotations, torch.arange(60.0).reshape(20, 3), 8)
-    _, positions = memory.regressed(memory.similarity(torch.ones(1, 10, 2, 2)))
+    _, positions = memory.regressed(similarity_to(memory, torch.ones(1, 10, 2, 2)))
     assert np.allclose(positions[0], [28.5, 29.5, 30.5], atol=0.1)
 
 
