@@ -26,7 +26,9 @@ import numpy as np
 from _data import data_folder
 from _maps import DEMO_ROOM, compiled_path
 from numpy.typing import NDArray
+from peers import commit
 from photos import CASES, compiled
+from tables import covariance
 
 from igaussian_core.bags import Bag
 from igaussian_core.calibrate import MIN_POSES, covariance_scale
@@ -43,6 +45,7 @@ from igaussian_core.evaluate.metrics import (
     summarize,
 )
 from igaussian_core.evaluate.photos import PhotoQueries, extent, held_out_images
+from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.evaluate.runner import run
 from igaussian_core.geometry import compose, rotation_from_vector
 from igaussian_core.localizer import Localizer
@@ -92,7 +95,9 @@ def main() -> None:
     arguments = parser.parse_args()
     # no time limit, so that other work on the machine changes times and not answers
     config = load_config(None, ["runtime.budget_ms=60000", *arguments.set])
-    report, pooled = {}, {"photos": [], "renders": []}
+    report: dict[str, dict[str, object]] = {"facts": {**machine_facts(), "commit": commit()}}
+    sets = report["sets"] = {}
+    pooled: dict[str, list[QueryOutcome]] = {"photos": [], "renders": []}
     tests: dict[str, Test] = {}
     print("| set | poses | mean NEES | median NEES | inside the 95 % ellipsoid |")
     print("|---|---|---|---|---|")
@@ -123,13 +128,14 @@ def main() -> None:
                     tests[f"{name}, half by half"] = _half_by_half(even, odd)
                 elif track == "photos":
                     tests[name] = _each_by_the_others(_nees(outcomes))
-                report[f"{name}, {track}"] = _row(f"{name}, {track}", outcomes, 0.05 * size)
+                sets[f"{name}, {track}"] = _row(f"{name}, {track}", outcomes, 0.05 * size)
     for track, outcomes in pooled.items():
-        report[f"all {track}"] = _row(f"all {track}", outcomes, float("inf"))
+        sets[f"all {track}"] = _row(f"all {track}", outcomes, float("inf"))
     drive = _drive(arguments.work, config)
     first, second = drive[: len(drive) // 2], drive[len(drive) // 2 :]
     tests["drive, half by half"] = _half_by_half(first, second)
-    report["calibrated"] = _calibrated(tests)
+    report["calibrated"] = {name: _calibrated(test) for name, test in tests.items()}
+    print(covariance(report))
     if arguments.json:
         arguments.json.write_text(json.dumps(report, indent=1))
 
@@ -187,22 +193,18 @@ def _drive(work: Path | None, config: Config) -> Array:
     return np.array(found)
 
 
-def _calibrated(tests: dict[str, Test]) -> dict[str, object]:
-    print("\n| poses that calibration did not see | poses | mean NEES | inside | calibrated on "
-          "| factor | mean NEES | inside |")  # fmt: skip
-    print("|---|---|---|---|---|---|---|---|")
-    report: dict[str, object] = {}
-    for name, test in tests.items():
-        before = f"{len(test.nees)} | {test.nees.mean():.1f} | {(test.nees < NEES_95).mean():.1%}"
-        report[name] = {"nees": test.nees.tolist(), "scales": test.scales.tolist(),
-                        "calibrated_on": test.calibrated_on}  # fmt: skip
-        if not np.isfinite(test.scales).all():
-            print(f"| {name} | {before} | {test.calibrated_on}: too few | | | |", flush=True)
-            continue
-        after = test.nees / test.scales
-        print(f"| {name} | {before} | {test.calibrated_on} | {np.median(test.scales):.2f} "
-              f"| {after.mean():.1f} | {(after < NEES_95).mean():.1%} |", flush=True)  # fmt: skip
-    return report
+def _calibrated(test: Test) -> dict[str, object]:
+    found: dict[str, object] = {
+        "poses": len(test.nees), "calibrated_on": test.calibrated_on, **_figures(test.nees)
+    }  # fmt: skip
+    if np.isfinite(test.scales).all():
+        found["factor"] = float(np.median(test.scales))
+        found["after"] = _figures(test.nees / test.scales)
+    return found
+
+
+def _figures(nees: Array) -> dict[str, float]:
+    return {"mean_nees": float(nees.mean()), "inside_95": float((nees < NEES_95).mean())}
 
 
 def _views(

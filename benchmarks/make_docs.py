@@ -29,6 +29,12 @@ SECTIONS: dict[str, Callable[[dict[str, Any]], str]] = {
         "igaussian eval rendered --map room.igmap --json out.json --report report.html",
     ),
     "photos": tables.photos,
+    "drive": tables.evaluation(
+        "Tracking: every frame of the bundled drive",
+        "igaussian eval bag bags/demo/drive --map room.igmap --every-frame --json out.json",
+    ),
+    "verdict": tables.verdict,
+    "covariance": tables.covariance,
     "stage_one": tables.stage_one,
     "scale": tables.scale,
     "render": render_tables.section,
@@ -66,7 +72,8 @@ def keep(source: Path, name: str) -> None:
     data = json.loads(source.read_text())
     for part in [data, *(row for row in data.get("photos", []) if isinstance(row, dict))]:
         part.pop("queries", None)
-    data.pop("config", None)
+    for part in ("config", "answers"):
+        data.pop(part, None)
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.json").write_text(json.dumps(data, indent=1) + "\n")
 

@@ -6,9 +6,10 @@
 Tables: the rendered track (layout of the paper's tables 1 and 3), pure rotation (table 2),
 photos, the ablation (table 4), the number of source views (figure 5). Methods are described in
 peer_methods.py; the slow one runs on fewer queries, which the table says. Finished runs are
-kept in --work, so that an interrupted benchmark goes on. Rows that need a network which is not
-trained yet say so. With --methods only methods whose names contain one of those run, and the other
-rows of --json stay as they are. Needs the data folder (_data.py) and pycolmap (extra `bench`).
+kept in --work, so that an interrupted benchmark goes on. Methods that need a network trained on the
+map are left out where stage_one.py trained none. With --methods only methods whose names contain
+one of those run, and the other rows of --json stay as they are. Needs the data folder (_data.py)
+and pycolmap (extra `bench`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import functools
 import json
 import math
 import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,8 +77,8 @@ VIEW_COUNTS = {
 }  # fmt: skip
 
 
-class NotBuilt(Exception):
-    """A method that needs a stage which does not exist yet; says which."""
+class NotTrained(Exception):
+    """A method that needs a network trained on the map; there is none."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,7 @@ def _with_network(case: Case, trained_for: str) -> MapPackage:
     """The case's map with the network that stage_one.py trained on it."""
     network = trained_network(case.map, trained_for)
     if network is None:
-        raise NotBuilt("a pose network trained on the map: python benchmarks/stage_one.py")
+        raise NotTrained
     return dataclasses.replace(case.package, network=network)
 
 
@@ -272,8 +274,7 @@ def _merged(before: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[di
     measured = {key(row): row for row in rows}
     merged = []
     for row in before:
-        now = measured.pop(key(row), row)
-        merged.append(row if "not_built" in now and "not_built" not in row else now)
+        merged.append(measured.pop(key(row), row))
     return merged + list(measured.values())
 
 
@@ -347,8 +348,8 @@ def _rows(
         row: dict[str, Any] = {"case": case.name, "method": method.name}
         try:
             outcomes = _outcomes(case, method, work, table, scale)
-        except NotBuilt as error:
-            rows.append({**row, "not_built": str(error)})
+        except NotTrained:
+            print(f"{case.name}: left out, no network trained: {method.name}", file=sys.stderr)
             continue
         limits = (case.max_deg, case.max_distance)
         row["summary"] = plain(summarize(outcomes, *limits))

@@ -18,15 +18,6 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def peers_markdown(name: str, rows: Sequence[Row]) -> str:
     """A table of benchmarks/peers.py in the layout that fits it."""
-    return _layout(name, rows) + _missing(rows)
-
-
-def _missing(rows: Sequence[Row]) -> str:
-    needs = sorted({row["not_built"] for row in rows if "not_built" in row})
-    return "".join(f"\n\nRows that are not built need {need}." for need in needs)
-
-
-def _layout(name: str, rows: Sequence[Row]) -> str:
     if name == "rotation":
         keys = ("mean_deg", "median_deg", "within_15_deg")
         return _by_bin(rows, keys, ("avg °", "med °", "≤ 15°"))
@@ -44,12 +35,8 @@ def _by_bin(rows: Sequence[Row], keys: Sequence[str], labels: Sequence[str]) -> 
     head = ["scene", "method", "queries", *(f"{label}, {b}°" for b in bins for label in labels)]
     lines = []
     for row in rows:
-        if "not_built" in row:
-            cells = ["not built", *["–"] * (len(head) - 3)]
-        else:
-            groups = row["groups"]
-            cells = [_count(row), *(value(groups[b], key) for b in bins for key in keys)]
-        lines.append([row["case"], row["method"], *cells])
+        cells = [value(row["groups"][b], key) for b in bins for key in keys]
+        lines.append([row["case"], row["method"], _count(row), *cells])
     return markdown(head, lines)
 
 
@@ -64,11 +51,8 @@ def _overall(rows: Sequence[Row]) -> str:
     head = ["scene", "method", "queries", *(label for _, label in _OVERALL)]
     lines = []
     for row in rows:
-        if "not_built" in row:
-            cells = ["not built", *["–"] * (len(head) - 3)]
-        else:
-            cells = [_count(row), *(value(row["summary"], key) for key, _ in _OVERALL)]
-        lines.append([row["case"], row["method"], *cells])
+        cells = [value(row["summary"], key) for key, _ in _OVERALL]
+        lines.append([row["case"], row["method"], _count(row), *cells])
     return markdown(head, lines)
 
 
@@ -88,6 +72,8 @@ def value(figures: Row, key: str) -> str:
         return str(int(number))
     if key.endswith("ms"):
         return f"{number:.0f}"
+    if key.endswith("nees"):
+        return f"{number:.1f}"
     return f"{number:.3f}" if key.endswith("deg") else f"{number:.4f}"
 
 
@@ -117,7 +103,7 @@ def peers(data: Row) -> str:
         "from the prior starts at the protocol's source pose (rendered) or 10 degrees and 5 % of "
         "the extent away (photos). `benchmarks/peer_methods.py` describes each. Photos succeed "
         "within 5 degrees and 5 % of the cameras' extent, rendered targets within 5 degrees and "
-        "0.05.",
+        "0.05. Methods with a network trained on the map are shown where one was trained.",
     ]
     for name, title in _PEER_TABLES.items():
         if name in data:
@@ -161,6 +147,59 @@ def photos(data: Row) -> str:
         "Photos of other scenes, all of which must be refused:",
         markdown(["map", "photos", "accepted", "most inliers"], crossed),
     ])  # fmt: skip
+
+
+def verdict(data: Row) -> str:
+    """benchmarks/verdict.py."""
+    kinds = data["images"]
+    keys = ("images", "accepted", "right", "wrong_accepted", "wrong_inliers")
+    rows = [
+        [kind, *(str(row[key]) for key in keys), f"{row['wrong_confidence']:.2f}"]
+        for kind, row in kinds.items()
+    ]
+    usable = [row for row in kinds.values() if row["usable"]]
+    right, all_usable = (sum(row[key] for row in usable) for key in ("right", "images"))
+    wrong, images = (sum(r[key] for r in kinds.values()) for key in ("wrong_accepted", "images"))
+    return "\n\n".join([
+        "## What must be refused, and what must not",
+        f"`python benchmarks/verdict.py --photos 3 --json out.json --roc docs/verdict_roc.png`. "
+        f"{_facts(data)}",
+        "Against five maps, from nothing; photos of other scenes also with a prior. Right: within "
+        "5 degrees and 5 % of the cameras' extent.",
+        markdown(["image", "images", "accepted", "right", "wrong, accepted",
+                  "most inliers of one not right", "its highest confidence"], rows),
+        f"Wrong but accepted: {wrong} of {images}. Right: {right} of {all_usable} usable photos.",
+    ])  # fmt: skip
+
+
+def covariance(data: Row) -> str:
+    """benchmarks/covariance.py."""
+    rows = [
+        [name, *(value(row, key) for key in ("accepted", "mean_nees", "median_nees", "inside_95"))]
+        for name, row in data["sets"].items()
+    ]
+    calibrated = []
+    for name, row in data["calibrated"].items():
+        after = row.get("after")
+        factor = f"{row['factor']:.2f}" if after else "too few"
+        calibrated.append([
+            name, str(row["poses"]), *_nees(row), str(row["calibrated_on"]), factor,
+            *(_nees(after) if after else ("–", "–")),
+        ])  # fmt: skip
+    return "\n\n".join([
+        "## Is the covariance true?", f"`python benchmarks/covariance.py --json out.json`. "
+        f"{_facts(data)}",
+        "True: NEES 6 on average, 95 % of the errors inside the 95 % ellipsoid. As maps are "
+        "compiled, not calibrated:",
+        markdown(["set", "poses", "mean NEES", "median NEES", "inside"], rows),
+        "Calibrated (`igaussian map calibrate`), judged on poses that the calibration did not see:",
+        markdown(["poses", "number", "mean NEES, before", "inside, before", "calibrated on",
+                  "factor", "mean NEES", "inside"], calibrated),
+    ])  # fmt: skip
+
+
+def _nees(figures: Row) -> tuple[str, str]:
+    return f"{figures['mean_nees']:.1f}", f"{100 * figures['inside_95']:.0f} %"
 
 
 def stage_one(data: Row) -> str:

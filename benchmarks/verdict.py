@@ -29,13 +29,16 @@ import cv2
 import numpy as np
 from _data import data_folder
 from numpy.typing import NDArray
+from peers import commit
 from photos import CASES, compiled
+from tables import verdict
 
 from igaussian_core.camera import Camera
 from igaussian_core.cli_tools import load_config
 from igaussian_core.compile_map import training_images
 from igaussian_core.evaluate.image_changes import Change
 from igaussian_core.evaluate.photos import extent, held_out_images
+from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.geometry import pose_error
 from igaussian_core.localizer import Localizer
 from igaussian_core.posed_images import PosedImage, read_posed_images
@@ -106,9 +109,13 @@ def main() -> None:
             cases = _cases(localizer, folder, prefix, arguments.photos)
             answers += [_answer(localizer, name, case, size) for case in cases]
             print(f"{name}: {sum(a.map == name for a in answers)} images", flush=True)
-    _print_tables(answers)
+    report = {
+        "facts": {**machine_facts(), "commit": commit()}, "images": _by_kind(answers),
+        "answers": [asdict(a) for a in answers],
+    }  # fmt: skip
+    print(verdict(report))
     if arguments.json:
-        arguments.json.write_text(json.dumps([asdict(a) for a in answers], indent=1))
+        arguments.json.write_text(json.dumps(report, indent=1))
     if arguments.roc:
         _draw(answers, arguments.roc)
 
@@ -182,22 +189,21 @@ def _answer(localizer: Localizer, map_name: str, case: Case, size: float) -> Ans
     )  # fmt: skip
 
 
-def _print_tables(answers: list[Answer]) -> None:
-    print("\n| image | images | accepted | right | wrong, accepted | most inliers, confidence "
-          "of a wrong one |")
-    print("|---|---|---|---|---|---|")
+def _by_kind(answers: list[Answer]) -> dict[str, dict[str, object]]:
+    kinds: dict[str, dict[str, object]] = {}
     for kind in dict.fromkeys(a.kind for a in answers):
         some = [a for a in answers if a.kind == kind]
-        accepted, right = [a for a in some if a.accepted], sum(a.right for a in some)
-        most = max((a.inliers for a in some if not a.right), default=0)
-        sure = max((a.confidence for a in some if not a.right), default=0.0)
-        print(f"| {kind} | {len(some)} | {len(accepted)} | {right} ({right / len(some):.1%}) "
-              f"| {len(accepted) - right} | {most}, {sure:.2f} |")  # fmt: skip
-    wrong = sum(a.accepted and not a.right for a in answers)
-    kinds = [a for a in answers if a.kind in HARMLESS]
-    recall = sum(a.right for a in kinds) / len(kinds)
-    print(f"\nwrong but accepted: {wrong} of {len(answers)} ({wrong / len(answers):.2%}), "
-          f"recall over {len(kinds)} usable photos {recall:.1%}")  # fmt: skip
+        wrong = [a for a in some if not a.right]
+        kinds[kind] = {
+            "images": len(some),
+            "accepted": sum(a.accepted for a in some),
+            "right": sum(a.right for a in some),
+            "wrong_accepted": sum(a.accepted for a in wrong),
+            "wrong_inliers": max((a.inliers for a in wrong), default=0),
+            "wrong_confidence": max((a.confidence for a in wrong), default=0.0),
+            "usable": kind in HARMLESS,
+        }
+    return kinds
 
 
 def _draw(answers: list[Answer], path: Path) -> None:

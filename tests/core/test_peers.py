@@ -143,24 +143,40 @@ def test_measured_rows_take_the_place_of_their_own_alone() -> None:
     before = [{"case": "a", "method": m, "summary": m} for m in ("ours", "other", "trained")]
     now = [
         {"case": "a", "method": "ours", "summary": "anew"},
-        {"case": "a", "method": "trained", "not_built": "no network"},
         {"case": "b", "method": "ours", "summary": "new"},
     ]
     merged = peers_command._merged(before, now)
     assert [row["summary"] for row in merged] == ["anew", "other", "trained", "new"]
 
 
-def test_rows_without_their_stage_say_so() -> None:
+def test_rows_of_peers() -> None:
     figures = {"success": 1.0, "median_ms": 12.3, "queries": 3, "mean_deg": 0.5}
-    rows = [
-        {"case": "lego", "method": "ours", "summary": figures, "groups": {"20-40": figures}},
-        {"case": "lego", "method": "paper", "not_built": "a network"},
-    ]
-    text = tables.peers_markdown("rendered", rows)
-    assert "| lego | ours | 3 | 100.0 % | 12 |" in text
-    assert "| lego | paper | not built | – | – |" in text
-    assert "need a network." in text
+    rows = [{"case": "lego", "method": "ours", "summary": figures, "groups": {"20-40": figures}}]
+    assert "| lego | ours | 3 | 100.0 % | 12 |" in tables.peers_markdown("rendered", rows)
     assert "| lego | ours | 3 | 100.0 % | – | 0.500 |" in tables.peers_markdown("photos", rows)
+
+
+def test_a_verdict_counts_by_kind_of_image() -> None:
+    def row(accepted: int, right: int, usable: bool) -> dict[str, object]:
+        return {"images": 9, "accepted": accepted, "right": right, "usable": usable,
+                "wrong_accepted": accepted - right, "wrong_inliers": 7,
+                "wrong_confidence": 0.25}  # fmt: skip
+
+    text = tables.verdict({"images": {"as taken": row(9, 8, True), "black": row(2, 0, False)}})
+    assert "| black | 9 | 2 | 0 | 2 | 7 | 0.25 |" in text
+    assert text.endswith("Wrong but accepted: 3 of 18. Right: 8 of 9 usable photos.")
+
+
+def test_a_covariance_too_few_poses_could_calibrate() -> None:
+    figures = {"mean_nees": 4.0, "median_nees": 3.0, "inside_95": 1.0}
+    few = {"poses": 7, "calibrated_on": 6, **figures}
+    many = {"poses": 9, "calibrated_on": 50, **figures, "factor": 0.5, "after": figures}
+    text = tables.covariance(
+        {"sets": {"fox": {"accepted": 7, **figures}}, "calibrated": {"fox": few, "lego": many}}
+    )
+    assert "| fox | 7 | 4.0 | 3.0 | 100.0 % |" in text
+    assert "| fox | 7 | 4.0 | 100 % | 6 | too few | – | – |" in text
+    assert "| lego | 9 | 4.0 | 100 % | 50 | 0.50 | 4.0 | 100 % |" in text
 
 
 def test_kept_figures_hold_no_single_queries(
