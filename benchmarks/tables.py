@@ -132,6 +132,17 @@ def evaluation(title: str, command: str) -> Callable[[Row], str]:
     return section
 
 
+def drive(data: Row) -> str:
+    """One output of `igaussian eval bag`."""
+    return "\n\n".join([
+        "## Tracking: every frame of the bundled drive",
+        "`igaussian eval bag bags/demo/drive --map room.igmap --every-frame --duration 12 "
+        f"--json out.json`. {_facts(data)}",
+        markdown(["figure", "value"],
+                 [[key, f"{number:.4g}"] for key, number in data["summary"].items()]),
+    ])  # fmt: skip
+
+
 def photos(data: Row) -> str:
     """benchmarks/photos.py."""
     keys = ("success", "wrong_accepted", "median_deg", "median_distance", "p90_deg",
