@@ -279,8 +279,9 @@ def scale(data: Row) -> str:
                for name, rows in data["solver"].items() for how, r in rows.items()]  # fmt: skip
     return "\n\n".join([
         "## The paper's learned scale",
-        "`python benchmarks/scale.py --map lego.igmap --map room.igmap --each 8`. Median relative "
-        "error of the translation's length between a hypothesis and the image:",
+        "`python benchmarks/scale.py --map lego.igmap --map room.igmap --each 8 "
+        f"--json out.json`. {_facts(data)}",
+        "Median relative error of the translation's length between a hypothesis and the image:",
         markdown(["maps", "pairs", "ViT", "rendered depth", "best constant"], lengths),
         "The paper's protocol without a prior; medians over accepted poses, map units as cm / 100:",
         markdown(["map", "solver, scale", "accepted", "within 5°, 5 cm", "med °", "med cm"],

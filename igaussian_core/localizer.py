@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import islice
 
 import cv2
 import numpy as np
@@ -18,7 +17,7 @@ from igaussian_core.coarse.network import MapNetwork, NetworkLocalizer
 from igaussian_core.config import Config
 from igaussian_core.errors import CameraError, MapError
 from igaussian_core.features import Matcher, make_matcher
-from igaussian_core.geometry import Sim3, compose, is_rigid, nearest_rotation, pose_error
+from igaussian_core.geometry import Sim3, compose, is_rigid, nearest_rotation
 from igaussian_core.hypothesis import Hypothesis
 from igaussian_core.map_package import Manifest, MapPackage, open_package
 from igaussian_core.query import Query
@@ -26,15 +25,13 @@ from igaussian_core.refine.refiner import Refinement, Refiner
 from igaussian_core.refine.resemblance import most_alike
 from igaussian_core.refine.verify import Evidence, confidence, judge, thresholds
 from igaussian_core.result import LocalizationResult, Status
+from igaussian_core.rivals import Rivals
 from igaussian_core.timing import StageTimer
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-_SAME_PLACE = 0.1  # image widths between poses that are no rivals
 _TRACKS_SHARE = 0.5  # of the time limit, for a frame that has a prior
-_ELSEWHERE = 0.5  # image widths beyond which a view is hardly one of the same place
-_VIEWS, _APPROACHED = 100, 8  # that are looked through for rivals
 
 
 class Localizer:
@@ -59,6 +56,7 @@ class Localizer:
             self._render_scene, self._matcher, self._config.features.keypoints,
             self._config.refine, self._config.verify,
         )  # fmt: skip
+        self._rivals = Rivals(self._config.coarse.rival_share, self._refiner, self._tried)
 
     @staticmethod
     def open(path: str | os.PathLike[str], config: Config | None = None) -> Localizer:
@@ -121,7 +119,7 @@ class Localizer:
             result = self._result(hypothesis, refinement)
             if result.ok:
                 if timer.elapsed_ms() <= budget_ms:
-                    result = self._unless_ambiguous(query, hypothesis, refinement, result)
+                    result = self._rivals.settled(query, hypothesis, refinement, result)
                 return _timed(result, timer)
             if result.inliers >= failure.inliers:
                 failure = result
@@ -202,6 +200,12 @@ class Localizer:
         end_ms = query.timer.elapsed_ms() + self._refiner.match_ms
         return prior is not None and end_ms > _TRACKS_SHARE * self._config.runtime.budget_ms
 
+    def _tried(
+        self, query: Query, hypothesis: Hypothesis
+    ) -> tuple[Refinement, LocalizationResult]:
+        refinement = self._refine(query, hypothesis, None)
+        return refinement, self._result(hypothesis, refinement)
+
     def _refine(
         self, query: Query, hypothesis: Hypothesis, prior: ArrayLike | None
     ) -> Refinement:
@@ -213,49 +217,6 @@ class Localizer:
             align=hypothesis.align,
             describe=hypothesis.describe,
         )
-
-    def _unless_ambiguous(
-        self, query: Query, hypothesis: Hypothesis, found: Refinement, result: LocalizationResult
-    ) -> LocalizationResult:
-        """An accepted pose; a rival where that convinces more, neither where both do alike."""
-        for rival in self._rivals(query, hypothesis, found):
-            tried = replace(hypothesis, T_scene_cam=rival, align=True)
-            other_found = self._refine(query, tried, None)
-            other = self._result(tried, other_found)
-            if not other.ok or other_found.T_scene_cam is None:
-                continue
-            if not self._apart(query, found, other_found.T_scene_cam, _SAME_PLACE):
-                continue
-            weaker, stronger = sorted((result, other), key=lambda r: r.inliers)
-            if weaker.inliers >= self._config.coarse.rival_share * stronger.inliers:
-                return _ambiguous(stronger, weaker)
-            if stronger is other:
-                return other
-        return result
-
-    def _rivals(
-        self, query: Query, hypothesis: Hypothesis, found: Refinement
-    ) -> Iterator[Array]:
-        """Places that are not on the way to an accepted one.
-
-        Of the network's, views that resemble the image: those nearby lead to the accepted place,
-        and so do most of the others, which one round of the approach tells.
-        """
-        if self._config.coarse.rival_share > 1:
-            return
-        if hypothesis.source != "network":
-            yield from (T for T in hypothesis.others if self._apart(query, found, T, _SAME_PLACE))
-            return
-        views = islice(hypothesis.others, _VIEWS)
-        far = (T for T in views if self._apart(query, found, T, _ELSEWHERE))
-        for T_scene_cam in islice(far, _APPROACHED):
-            nearer = self._refiner.approach(query, T_scene_cam, rounds=1)
-            if nearer is not None and self._apart(query, found, nearer, 0.5 * _ELSEWHERE):
-                yield nearer
-
-    @staticmethod
-    def _apart(query: Query, found: Refinement, T_scene_cam: Array, least: float) -> bool:
-        return found.shift(query.camera, T_scene_cam) >= least
 
     def _result(self, hypothesis: Hypothesis, refinement: Refinement) -> LocalizationResult:
         evidence = refinement.evidence
@@ -368,21 +329,6 @@ def _contrast(image: NDArray[np.uint8]) -> float:
     """Standard deviation of grey levels at low resolution, where noise is no contrast."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return float(np.std(cv2.resize(gray, (64, 48), interpolation=cv2.INTER_AREA)))
-
-
-def _ambiguous(result: LocalizationResult, other: LocalizationResult) -> LocalizationResult:
-    """Neither of two accepted poses; the more alike they are, the less confident."""
-    assert result.T_map_cam is not None and other.T_map_cam is not None
-    angle, distance = pose_error(result.T_map_cam, other.T_map_cam)
-    return replace(
-        result,
-        status=Status.INCONSISTENT,
-        reason=f"two places fit alike, {distance:.2g} m and {angle:.0f} degrees apart: "
-        f"{result.inliers} and {other.inliers} inliers",
-        T_map_cam=None,
-        covariance=None,
-        confidence=min(result.confidence, 0.5 * (1 - other.inliers / result.inliers)),
-    )
 
 
 def _out_of_time(best: LocalizationResult, budget_ms: float) -> LocalizationResult:

@@ -33,6 +33,7 @@ LAYERS = [
     ["view_planning", "map_summary"],
     ["pruning", "procedural"],
     ["coarse", "refine"],
+    ["rivals"],
     ["localizer"],
     ["tracker", "replay", "training", "compile_map", "evaluate"],
     ["calibrate"],
