@@ -186,12 +186,13 @@ def _judged(
     package: MapPackage, name: str, method: str, network: NetworkData | None,
     options: argparse.Namespace, corrections: tuple[int, ...] = (0,),
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Rows of a network's heads and of its memory, corrected by so many renders each, or one of
-    the landmarks."""
+    """Rows of a network's heads and of its memory, corrected by so many renders, or one of the
+    landmarks."""
     rows = []
     trained = network is not None and _report(network).get("heads")
-    heads = ("attention", "memory") if trained else ("memory",)
-    asked = [(h, count) for h in heads for count in corrections] if network else [("", 0)]
+    asked = [("memory", count) for count in corrections] if network else [("", 0)]
+    if trained:
+        asked.insert(0, ("attention", 0))
     for head, renders in asked:
         config = Config.from_flat(
             {"coarse.method": "network", "coarse.network_head": head,

@@ -74,6 +74,8 @@ def value(figures: Row, key: str) -> str:
         return f"{number:.0f}"
     if key.endswith("nees"):
         return f"{number:.1f}"
+    if number >= 1e4:
+        return f"{number:.1e}"
     return f"{number:.3f}" if key.endswith("deg") else f"{number:.4f}"
 
 
