@@ -12,7 +12,6 @@ pipeline on the rendered track with either scale, and with PnP.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -194,10 +193,10 @@ def solvers(arguments: argparse.Namespace) -> dict[str, dict[str, dict[str, floa
         package = open_package(path)
         sphere, camera = sphere_of(package), camera_of(package).undistorted()
         usable = shows_enough(package.gaussians, camera) if sphere.kind == "scene" else _any
+        red, green, blue = package.manifest.background
         queries = RenderedQueries(
-            tuple(targets(sphere, arguments.each, usable=usable)),
-            dataclasses.replace(package.gaussians), camera, (0.0, 0.0, 0.0),
-            package.T_map_scene, (_CHANGE,),
+            tuple(targets(sphere, arguments.each, usable=usable)), package.gaussians, camera,
+            (red, green, blue), package.T_map_scene, (_CHANGE,),
         )  # fmt: skip
         result[path.stem] = {}
         for solver, scale in (row.split("/") for row in arguments.solvers.split(",")):
