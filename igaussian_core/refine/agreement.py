@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from igaussian_core.camera import Camera
 from igaussian_core.contrast import Gray, blocks
 
 Mask = NDArray[np.bool_]
@@ -22,6 +23,28 @@ _MIN_CELLS = 4
 _MIN_TEXTURE = 6.0  # grey levels of standard deviation that a cell of the render must have
 _FLAT = 0.5  # and one of the image: what covers the lens is flat
 _DETAIL_PX = (2.0, 4.0)  # sigmas of the band that blur takes first
+
+
+def plane_homography(
+    camera: Camera, T_image_render: NDArray[np.float64], depth: float
+) -> NDArray[np.float64]:
+    """Pixels of a render to pixels of the image, 3x3, as if all lay on a plane across the view.
+
+    Args:
+        T_image_render: between their cameras, 4x4; a few pixels apart.
+        depth: of the plane in the render.
+    """
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    R, t = T_image_render[:3, :3], T_image_render[:3, 3]
+    return np.asarray(K @ (R + np.outer(t, (0, 0, 1 / max(depth, 1e-9)))) @ np.linalg.inv(K))
+
+
+def seen_through(H: NDArray[np.float64], image: Gray) -> Gray:
+    """An image as the render's camera would see it; its edge goes on where it saw nothing."""
+    size = image.shape[1], image.shape[0]
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    shifted = cv2.warpPerspective(image, H, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(shifted, np.uint8)
 
 
 def agreement(image: Gray, render: Gray, known: Mask, uv: Pixels) -> float:

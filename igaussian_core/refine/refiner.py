@@ -17,7 +17,12 @@ from igaussian_core.geometry import inverse, pose_error, transform_points
 from igaussian_core.lifting import at_pixels, sample, trusted_depth, unproject
 from igaussian_core.pnp import pose_covariance, reprojection_errors, solve_pnp
 from igaussian_core.query import Query
-from igaussian_core.refine.agreement import agreement, sharpness
+from igaussian_core.refine.agreement import (
+    agreement,
+    plane_homography,
+    seen_through,
+    sharpness,
+)
 from igaussian_core.refine.alignment import follow, follow_corners
 from igaussian_core.refine.matchers import GuidedKeypoints, PairMatcher, make_pair_matcher
 from igaussian_core.refine.photometric import align_photometric
@@ -34,12 +39,14 @@ RenderFunction = Callable[[Camera, Array], tuple[Image, Image, Image]]
 
 _MIN_COVERAGE = 0.02  # with less there is nothing to match
 _MAX_SUBPIXEL_MOVE_PX = 4.0
-_MAX_COMPARED_MOVE_PX = 3.0  # of a render that still shows what the image does
+_MAX_COMPARED_MOVE_PX = 5.0  # of a render that still shows what the image does, once shifted
+_UNSHIFTED_PX = 0.5
 _SOFT_PX = 1.0  # sigma that rids brightness of noise and of what the map shows sharper or softer
 _MAX_LOST_INLIERS = 0.05  # share of the matches' inliers that photometric alignment may lose
 _MAX_WORSE_PX = 0.1  # and by how much their median error may grow
 # following points on images made small, where they may lie far from where they are looked for
 _APPROACH_POINTS, _APPROACH_WINDOW, _APPROACH_LEVELS, _APPROACH_ROUNDS = 150, 11, 3, 3
+_UNCONVINCED = 0.5  # of refine.converged_px, for a pose that another round may make convince
 _MIN_APPROACHED = 12  # points that must agree
 _USUAL_MATCH_MS = 400.0  # on two cores, before it was measured
 
@@ -210,7 +217,8 @@ class Refiner:
                 return result
             step_px = _motion_px(query.camera, result.T_scene_cam, T_scene_cam, view.median_depth)
             T_scene_cam = result.T_scene_cam
-            if step_px < self._config.converged_px:
+            convinces = self._status(result) is Status.OK
+            if step_px < self._config.converged_px * (1.0 if convinces else _UNCONVINCED):
                 break
         return result
 
@@ -282,15 +290,23 @@ class Refiner:
         moved_px = _motion_px(camera, T_scene_cam, support.T_scene_view, view.median_depth)
         if moved_px > _MAX_COMPARED_MOVE_PX:
             view = self._view(query, T_scene_cam)
+            moved_px = 0.0
         with query.timer("compare"):
             uv = support.uv_image[support.inliers]
             grey = query.once("grey", lambda: cv2.cvtColor(query.image, cv2.COLOR_RGB2GRAY))
+            normal = query.gray
+            if moved_px > _UNSHIFTED_PX:
+                H = plane_homography(
+                    camera, inverse(T_scene_cam) @ support.T_scene_view, view.median_depth
+                )
+                grey, normal = seen_through(H, grey), seen_through(H, normal)
+                uv = cv2.perspectiveTransform(uv[None].astype(np.float32), np.linalg.inv(H))[0]
             render = np.asarray(cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY), np.uint8)
             shift = float("nan") if prior is None else found.shift(camera, prior)
             evidence = replace(
                 found.evidence,
                 agreement=agreement(grey, render, view.covered, uv),
-                sharpness=sharpness(query.gray, view.gray, view.covered, uv),
+                sharpness=sharpness(normal, view.gray, view.covered, uv),
                 prior_shift=shift,
             )
         return replace(found, evidence=evidence)
