@@ -7,8 +7,15 @@ import numpy as np
 import pytest
 from test_alignment import moved, texture
 
+from igaussian_core.camera import Camera
 from igaussian_core.contrast import normalize_contrast
-from igaussian_core.refine.agreement import agreement, sharpness
+from igaussian_core.geometry import compose, inverse, rotation_from_vector, transform_points
+from igaussian_core.refine.agreement import (
+    agreement,
+    plane_homography,
+    seen_through,
+    sharpness,
+)
 
 KNOWN = np.ones((240, 320), bool)
 GRID = np.stack(np.meshgrid(np.arange(12, 320, 24), np.arange(12, 240, 24)), -1).reshape(-1, 2)
@@ -91,3 +98,31 @@ def test_sizes_that_are_no_multiple_of_a_cell(size: tuple[int, int]) -> None:
     uv = grid.astype(np.float32)
     assert agreement(grey(image), grey(image), known, uv) == pytest.approx(1, abs=1e-5)
     assert sharpness(gray, gray, known, uv) == pytest.approx(1, abs=1e-5)
+
+
+CAMERA = Camera(320, 240, 300.0, 290.0, 158.0, 121.0)
+
+
+def test_a_homography_takes_the_plane_s_pixels_to_the_image() -> None:
+    turn = rotation_from_vector([0.01, -0.02, 0.03])
+    T_image_render = compose(turn, np.array([0.02, -0.01, 0.03]))
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.8, 0.8, (30, 2)), np.full(30, 2.5)])
+    H = plane_homography(CAMERA, T_image_render, 2.5)
+    expected = CAMERA.project(transform_points(T_image_render, points))
+    seen = cv2.perspectiveTransform(CAMERA.project(points)[None].astype(np.float64), H)[0]
+    np.testing.assert_allclose(seen, expected, atol=1e-6)
+
+
+def test_a_step_undone_is_no_blur() -> None:
+    """An image that is three pixels off agrees as it would at the right pose, once shifted."""
+    render = texture()
+    T_image_render = compose(np.eye(3), np.array([3 * 2.0 / CAMERA.fx, 0, 0]))
+    H = plane_homography(CAMERA, T_image_render, 2.0)
+    image = cv2.warpPerspective(render, H, (320, 240), borderMode=cv2.BORDER_REPLICATE)
+    unshifted, blurred = both(image, render)
+    alike, sharp = both(seen_through(H, image), render)
+    assert alike > unshifted and alike > 0.99
+    assert sharp > 0.8 > blurred
+    back = plane_homography(CAMERA, inverse(T_image_render), 2.0)
+    np.testing.assert_allclose(H @ back, np.eye(3), atol=1e-9)

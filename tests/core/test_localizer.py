@@ -66,6 +66,26 @@ def test_photos_are_localized_from_nothing(results: list[LocalizationResult]) ->
     assert np.median(errors[:, 0]) < 0.03 and np.median(errors[:, 1]) < 0.001
 
 
+def test_a_track_s_small_step_takes_one_render(
+    localizer: Localizer, room_map: GaussianMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And the comparison does not take the step for blur or for another place."""
+    T = QUERIES[0]
+    image = room.photo(room_map, T)
+    still = localizer.localize(image, room.CAMERA, prior=T)
+    step = compose(rotation_from_vector([0, 0.01, 0]), np.zeros(3))
+    renders = []
+    render = localizer._refiner._render
+    monkeypatch.setattr(
+        localizer._refiner, "_render", lambda *where: renders.append(where) or render(*where)
+    )
+    result = localizer.localize(image, room.CAMERA, prior=T @ step)
+    assert_right(result, T)
+    assert result.source == "prior" and len(renders) == 1
+    assert result.agreement == pytest.approx(still.agreement, abs=0.02)
+    assert result.sharpness == pytest.approx(still.sharpness, abs=0.1)
+
+
 def test_the_evidence_is_complete(results: list[LocalizationResult]) -> None:
     for result in results:
         assert result.status in (Status.OK, Status.OK_DEGRADED) and result.reason
