@@ -131,7 +131,8 @@ class RefineConfig:
     align_rounds: int = _option(3, "most renders one alignment gets", 1, 8)
     rounds: int = _option(2, "most renders matched by descriptors", 1, 8)
     converged_px: float = _option(
-        4.0, "image motion in pixels of a step below which no new render is made", 0.01, 16
+        4.0, "image motion in pixels below which a tracked frame gets no new render; others: half",
+        0.01, 16,
     )
     moved_px: float = _option(
         25.0, "image motion of a step above which descriptors are matched again", 1, 500

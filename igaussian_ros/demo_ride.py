@@ -358,18 +358,23 @@ class _Watch:
     def _add(self, status: HeardStatus, pose: tuple[Array, int] | None) -> None:
         stamp_ns = self._recorded_stamp(status.stamp_ns)
         first_ns = self.frames[0].stamp_ns if self.frames else stamp_ns
-        T_map_cam, latency_ms = None, math.nan
+        from igaussian_ros.convert import moved_covariance
+
+        T_map_cam, covariance, latency_ms = None, None, math.nan
         received_ns = status.received_ns
         if pose is not None:
             T_map_x, received_ns = pose
             T_base_cam = self._topics.T_base_cam
             T_map_cam = T_map_x if T_base_cam is None else T_map_x @ T_base_cam
+            covariance = self._listener.covariances.get(status.stamp_ns)
+            if covariance is not None:
+                covariance = moved_covariance(covariance, T_map_x, T_map_cam)
             latency_ms = (received_ns - status.stamp_ns) * 1e-6
         values = status.values
         frame = DriveFrame(
             stamp_ns, (stamp_ns - first_ns) * 1e-9, values["status"], values.get("reason", ""),
             T_map_cam, self._truth.at(stamp_ns), int(values.get("inliers", 0)), latency_ms,
-            received_ns * 1e-9, _timings(values),
+            received_ns * 1e-9, _timings(values), covariance,
         )  # fmt: skip
         self.frames.append(frame)
         self._on_frame(frame)

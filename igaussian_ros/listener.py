@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -45,6 +45,8 @@ class HeardStatus:
 class Listener(Node):
     """Keeps the localizer's poses, statuses and diagnostics, and true poses.
 
+    `covariances` are the poses' [6, 6], by stamp.
+
     Args:
         localizer: full name of the node.
         truth_topic: PoseStamped of the same frame as the localizer's poses; None: not heard.
@@ -59,11 +61,15 @@ class Listener(Node):
     ) -> None:
         super().__init__(name, **node_arguments)
         self.poses: list[HeardPose] = []
+        self.covariances: dict[int, NDArray[np.float64]] = {}
         self.truth: list[HeardPose] = []
         self.statuses: list[HeardStatus] = []
         self.diagnostics: dict[str, str] = {}
         qos = QoSProfile(depth=100)
         self.create_subscription(PoseStamped, f"{localizer}/pose", self._on_pose, qos)
+        self.create_subscription(
+            PoseWithCovarianceStamped, f"{localizer}/pose_with_covariance", self._on_covariance, qos
+        )
         self.create_subscription(DiagnosticArray, f"{localizer}/status", self._on_status, qos)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos)
         if truth_topic is not None:
@@ -86,6 +92,10 @@ class Listener(Node):
 
     def _on_pose(self, message: PoseStamped) -> None:
         self.poses.append(_heard(message))
+
+    def _on_covariance(self, message: PoseWithCovarianceStamped) -> None:
+        covariance = np.array(message.pose.covariance, np.float64).reshape(6, 6)
+        self.covariances[stamp_to_ns(message.header.stamp)] = covariance
 
     def _on_truth(self, message: PoseStamped) -> None:
         self.truth.append(_heard(message))

@@ -28,6 +28,7 @@ class DriveFrame:
         T_map_cam_true: the true pose at the stamp, or None where the truth does not cover it.
         latency_ms: from the image's stamp until the pose was there; NaN without a pose.
         arrived_s: when the outcome was there, wall time since the drive began.
+        covariance: of the accepted pose, 6x6, map axes, x y z rx ry rz; None where not heard.
     """
 
     stamp_ns: int
@@ -40,6 +41,7 @@ class DriveFrame:
     latency_ms: float
     arrived_s: float
     timings_ms: dict[str, float] = field(default_factory=dict)
+    covariance: Array | None = None
 
     @property
     def error(self) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import matplotlib
 import numpy as np
-from matplotlib.collections import LineCollection
+from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -22,6 +22,7 @@ from igaussian_core.evaluate.metrics import plain
 from igaussian_core.evaluate.page import (
     BLUE,
     GREY,
+    ORANGE,
     RED,
     cards,
     facts_table,
@@ -35,6 +36,8 @@ from igaussian_core.evaluate.page import (
 
 Array = NDArray[np.float64]
 
+_ELLIPSES, _ELLIPSE_SHARE = 24, 0.06  # how many, how wide of the plan
+_CHI2_95 = 5.99  # of two numbers
 _LEAVE_OUT = 0.02  # share of the map's points that may lie outside the plan
 
 
@@ -141,7 +144,9 @@ def _trajectory_figure(drive: Drive) -> Figure:
     true = path @ plan.T
     if len(drive.truth):
         axis.plot(*true.T, color=GREY, linewidth=5, alpha=0.7, label="truth", zorder=3)
-    _draw_estimates(axis, drive.frames, plan, 0.05 * float(np.ptp(true, axis=0).max()))
+    size = float(np.ptp(true, axis=0).max())
+    _draw_estimates(axis, drive.frames, plan, 0.05 * size)
+    _draw_ellipses(axis, drive.frames, plan, size)
     axis.plot(*true[0], "o", color="black", markersize=7, zorder=6, label="start")
     axis.set(xlabel=names[0], ylabel=names[1], aspect="equal")
     axis.grid(visible=False)
@@ -194,6 +199,31 @@ def _draw_estimates(
     known = np.array([T[:3, 3] for T in lost if T is not None]).reshape(-1, 3) @ plan.T
     if len(known):
         axis.plot(*known.T, "x", color=RED, markersize=7, zorder=5, label=f"lost ({len(known)})")
+
+
+def _draw_ellipses(
+    axis: Any, frames: Sequence[DriveFrame], plan: Array, size: float
+) -> None:
+    """95 % ellipses of some positions, enlarged until they can be seen."""
+    known = [f for f in frames if f.T_map_cam is not None and f.covariance is not None]
+    if not known:
+        return
+    widths, centres, angles = [], [], []
+    for frame in known[:: max(1, len(known) // _ELLIPSES)]:
+        assert frame.T_map_cam is not None and frame.covariance is not None
+        values, axes = np.linalg.eigh(plan @ frame.covariance[:3, :3] @ plan.T)
+        widths.append(2 * np.sqrt(_CHI2_95 * np.maximum(values, 0)))
+        angles.append(np.degrees(np.arctan2(axes[1, 0], axes[0, 0])))
+        centres.append(plan @ frame.T_map_cam[:3, 3])
+    wanted = _ELLIPSE_SHARE * size / max(float(np.median(widths)), 1e-12)
+    times = max(1, int(float(f"{wanted:.0e}")))  # one digit
+    large = times * np.array(widths)
+    axis.add_collection(EllipseCollection(
+        large[:, 0], large[:, 1], angles, units="xy", offsets=centres, zorder=6,
+        offset_transform=axis.transData, facecolors="none", edgecolors=ORANGE, linewidths=1.2,
+    ))  # fmt: skip
+    axis.plot([], [], "o", markerfacecolor="none", markeredgecolor=ORANGE,
+              label=f"95 % ellipses, {times} times as large")  # fmt: skip
 
 
 def _error_figure(drive: Drive) -> Figure:

@@ -52,7 +52,7 @@ def run_drive(
         frame = DriveFrame(
             stamp_ns, (stamp_ns - first_ns) * 1e-9, result.status.value, result.reason,
             result.T_map_cam, truth.at(stamp_ns), result.inliers, latency_ms,
-            replayed.finished_s, result.timings_ms,
+            replayed.finished_s, result.timings_ms, result.covariance,
         )  # fmt: skip
         frames.append(frame)
         memory.append(MemorySample(replayed.finished_s, resident_mb(os.getpid())))

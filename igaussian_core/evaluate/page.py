@@ -15,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-GREY, BLUE, RED, GRID = "#8a939e", "#0b6fa4", "#c8322b", "#e4e8ec"
+GREY, BLUE, RED, ORANGE, GRID = "#8a939e", "#0b6fa4", "#c8322b", "#d9730d", "#e4e8ec"
 
 STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;color:#1c2530;margin:0;background:#f4f6f8}

@@ -46,7 +46,7 @@ _MAX_LOST_INLIERS = 0.05  # share of the matches' inliers that photometric align
 _MAX_WORSE_PX = 0.1  # and by how much their median error may grow
 # following points on images made small, where they may lie far from where they are looked for
 _APPROACH_POINTS, _APPROACH_WINDOW, _APPROACH_LEVELS, _APPROACH_ROUNDS = 150, 11, 3, 3
-_UNCONVINCED = 0.5  # of refine.converged_px, for a pose that another round may make convince
+_NOT_TRACKED = 0.5  # of refine.converged_px
 _MIN_APPROACHED = 12  # points that must agree
 _USUAL_MATCH_MS = 400.0  # on two cores, before it was measured
 
@@ -157,7 +157,7 @@ class Refiner:
         aligned = Refinement(None, None, Evidence("align"))
         start = T_scene_cam if near or not align else self.approach(query, T_scene_cam)
         if align and start is not None:
-            aligned = self.align(query, start)
+            aligned = self.align(query, start, near)
         if near and align and aligned.evidence.inliers < self._verify.min_inliers_align:
             start = self.approach(query, T_scene_cam)  # the camera turned faster than expected
             if start is not None and start is not T_scene_cam:
@@ -198,8 +198,11 @@ class Refiner:
                 T_scene_cam = solution.T_scene_cam
         return T_scene_cam
 
-    def align(self, query: Query, T_scene_cam: Array) -> Refinement:
-        """Follow points of the render into the image, PnP, again from there until it rests."""
+    def align(self, query: Query, T_scene_cam: Array, near: bool = False) -> Refinement:
+        """Follow points of the render into the image, PnP, again from there until it rests.
+
+        A track's pose that convinces may rest after a step twice as long as others.
+        """
         gray = query.gray
         result = Refinement(None, None, Evidence("align"))
         for _ in range(self._config.align_rounds):
@@ -217,8 +220,8 @@ class Refiner:
                 return result
             step_px = _motion_px(query.camera, result.T_scene_cam, T_scene_cam, view.median_depth)
             T_scene_cam = result.T_scene_cam
-            convinces = self._status(result) is Status.OK
-            if step_px < self._config.converged_px * (1.0 if convinces else _UNCONVINCED):
+            enough = near and self._status(result) is Status.OK
+            if step_px < self._config.converged_px * (1.0 if enough else _NOT_TRACKED):
                 break
         return result
 

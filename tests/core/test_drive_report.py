@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
@@ -11,12 +12,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.collections import EllipseCollection
 
 from igaussian_core.bags import Bag
 from igaussian_core.evaluate.drive import DriveFrame, MemorySample, Trajectory, summarize_drive
 from igaussian_core.evaluate.drive_overlays import Overlay
 from igaussian_core.evaluate.drive_recording import write_recording
-from igaussian_core.evaluate.drive_report import Drive, missed, plain, plan_axes, write_report
+from igaussian_core.evaluate.drive_report import (
+    Drive,
+    _trajectory_figure,
+    missed,
+    plain,
+    plan_axes,
+    write_report,
+)
 from igaussian_core.views import look_at
 
 START = 1_700_000_000_000_000_000
@@ -90,6 +99,24 @@ def test_pictures_and_figures_on_disk(tmp_path: Path) -> None:
     written = json.loads((tmp_path / "summary.json").read_text())
     assert written == plain(drive.figures)
     assert written["accepted"] == 19 and written["median_error_m"] == pytest.approx(0.01)
+
+
+def test_the_plan_shows_how_sure_positions_are() -> None:
+    """Ellipses 95 % of a position twice as uncertain along x, as large as the legend says."""
+    poses = _poses()
+    covariance = np.diag([4e-6, 1e-6, 1e-6, 1e-8, 1e-8, 1e-8])
+    known = [dataclasses.replace(f, covariance=covariance) for f in _frames(poses)]
+    for frames, expected in ((known, 1), (_frames(poses), 0)):
+        axis = _trajectory_figure(_drive(frames, poses)).axes[0]
+        drawn = [c for c in axis.collections if isinstance(c, EllipseCollection)]
+        assert len(drawn) == expected
+    (ellipses,) = (
+        c for c in _trajectory_figure(_drive(known, poses)).axes[0].collections
+        if isinstance(c, EllipseCollection)
+    )  # fmt: skip
+    assert len(ellipses.get_offsets()) == 19
+    sizes = np.sort(np.column_stack([ellipses.get_widths(), ellipses.get_heights()]), axis=1)
+    np.testing.assert_allclose(sizes[:, 1], 2 * sizes[:, 0])
 
 
 def test_a_drive_without_any_pose(tmp_path: Path) -> None:

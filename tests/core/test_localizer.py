@@ -305,7 +305,8 @@ def test_a_track_s_frame_matches_no_descriptors_that_would_end_too_late(
         return matched(query, T_scene_cam, near)
 
     monkeypatch.setattr(refiner, "match", match)
-    monkeypatch.setattr(refiner, "align", lambda query, T: Refinement(None, None, Evidence("")))
+    nothing = Refinement(None, None, Evidence(""))
+    monkeypatch.setattr(refiner, "align", lambda query, T, near=False: nothing)
     image = room.photo(room_map, QUERIES[0])
     away = QUERIES[0] @ compose(rotation_from_vector([0, np.pi, 0]), [0, 0, 0])
     assert_right(localizer.localize(image, room.CAMERA, away), QUERIES[0], degrees=0.3)
