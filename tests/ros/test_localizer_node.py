@@ -54,11 +54,11 @@ class Camera(Listener):
         self.lossy = self.create_publisher(Image, "/camera/image_raw", qos_profile_sensor_data)
         self.infos = self.create_publisher(CameraInfo, "/camera/camera_info", 10)
         self.initial = self.create_publisher(PoseWithCovarianceStamped, "/initialpose", 10)
-        self.covariances = []
+        self.covariance_messages = []
         self.create_subscription(
             PoseWithCovarianceStamped,
             "/localizer/pose_with_covariance",
-            self.covariances.append,
+            self.covariance_messages.append,
             QoSProfile(depth=100),
         )
 
@@ -137,7 +137,7 @@ def test_a_photo_gives_its_pose_with_its_stamp(camera, photo, corner):
     assert pose.frame == "map"
     assert int(values["inliers"]) >= 40 and float(values["ratio"]) > 0.5
     assert float(values["residual_px"]) < 2 and float(values["timing.total_ms"]) > 0
-    (message,) = [m for m in camera.covariances if m.header == header(stamp_ns, "map")]
+    (message,) = [m for m in camera.covariance_messages if m.header == header(stamp_ns, "map")]
     np.testing.assert_allclose(pose_from_ros(message.pose.pose), pose.T, atol=1e-12)
     covariance = np.array(message.pose.covariance).reshape(6, 6)
     np.testing.assert_allclose(covariance, covariance.T, atol=1e-12)
