@@ -24,9 +24,9 @@ from pathlib import Path
 
 import numpy as np
 from _data import data_folder
+from _facts import facts
 from _maps import DEMO_ROOM, compiled_path
 from numpy.typing import NDArray
-from peers import commit
 from photos import CASES, compiled
 from tables import covariance
 
@@ -45,7 +45,6 @@ from igaussian_core.evaluate.metrics import (
     summarize,
 )
 from igaussian_core.evaluate.photos import PhotoQueries, extent, held_out_images
-from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.evaluate.runner import run
 from igaussian_core.geometry import compose, rotation_from_vector
 from igaussian_core.localizer import Localizer
@@ -95,7 +94,7 @@ def main() -> None:
     arguments = parser.parse_args()
     # no time limit, so that other work on the machine changes times and not answers
     config = load_config(None, ["runtime.budget_ms=60000", *arguments.set])
-    report: dict[str, dict[str, object]] = {"facts": {**machine_facts(), "commit": commit()}}
+    report: dict[str, dict[str, object]] = {"facts": facts()}
     sets = report["sets"] = {}
     pooled: dict[str, list[QueryOutcome]] = {"photos": [], "renders": []}
     tests: dict[str, Test] = {}

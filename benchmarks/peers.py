@@ -19,7 +19,6 @@ import dataclasses
 import functools
 import json
 import math
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from typing import Any
 
 import numpy as np
 from _data import data_folder
+from _facts import facts
 from _maps import DEMO_ROOM, compiled, trained_network
 from peer_methods import (
     EssentialMatrix,
@@ -58,7 +58,6 @@ from igaussian_core.evaluate.rendered import (
     shows_enough,
     targets,
 )
-from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.evaluate.runner import Estimator, Partial, Queries, run
 from igaussian_core.geometry import compose, rotation_from_vector
 from igaussian_core.localizer import Localizer
@@ -235,7 +234,7 @@ def main() -> None:
         "ablation": _ablation_table, "views": _views_table,
     }  # fmt: skip
     before = _report_before(options)
-    report: dict[str, Any] = {"facts": {**machine_facts(), "commit": commit()}}
+    report: dict[str, Any] = {"facts": facts()}
     report["facts"]["queries"] = (
         f"{scale.each} targets a bin ({scale.slow_each} for gradient descent), at most "
         f"{scale.photos} photos a set ({scale.slow_photos}), {scale.references} reference views"
@@ -276,13 +275,6 @@ def _merged(before: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[di
     for row in before:
         merged.append(measured.pop(key(row), row))
     return merged + list(measured.values())
-
-
-def commit() -> str:
-    run_ = subprocess.run(
-        ["git", "-C", str(ROOT), "describe", "--always", "--dirty"], capture_output=True, text=True
-    )
-    return run_.stdout.strip() or "unknown"
 
 
 # --- tables ---

@@ -16,12 +16,12 @@ import tempfile
 from pathlib import Path
 
 from _data import data_folder
+from _facts import facts
 from _maps import compile_as_users_do
 
 from igaussian_core.compile_map import training_images
 from igaussian_core.evaluate.metrics import QueryOutcome, summarize, to_json
 from igaussian_core.evaluate.photos import PhotoQueries, extent, held_out_images
-from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.evaluate.runner import run
 from igaussian_core.localizer import Localizer
 from igaussian_core.posed_images import PosedImage, read_posed_images
@@ -51,7 +51,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         work = arguments.work or Path(temporary)
         report = {
-            "facts": machine_facts(), "photos": _photos(work), "cross_scene": _cross_scene(work)
+            "facts": facts(), "photos": _photos(work), "cross_scene": _cross_scene(work)
         }  # fmt: skip
     if arguments.json:
         arguments.json.write_text(json.dumps(report, indent=1))

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from _facts import facts
 from numpy.typing import NDArray
-from peers import commit
 
 import igaussian_core  # noqa: F401  before torch: says how idle threads wait
 from igaussian_core.camera import Camera
@@ -31,7 +31,6 @@ from igaussian_core.evaluate.rendered import (
     shows_enough,
     targets,
 )
-from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.features import XFeatMatcher
 from igaussian_core.gaussian_map import GaussianMap
 from igaussian_core.geometry import compose, inverse, pose_error, rotation_from_vector
@@ -66,7 +65,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     report = {
-        "facts": {**machine_facts(), "commit": commit()},
+        "facts": facts(),
         "length": lengths(arguments) if arguments.pairs else {},
         "solver": solvers(arguments) if arguments.each else {},
     }

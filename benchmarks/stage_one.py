@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 import torch
 from _data import data_folder
+from _facts import facts
 from _maps import DEMO_ROOM, STAGE_ONE, compiled, network_file
-from peers import commit
 from safetensors.numpy import save_file
 
 from igaussian_core.coarse.attention import PAPER, PLAIN, NetworkConfig, PoseNetwork
@@ -39,7 +39,6 @@ from igaussian_core.evaluate.image_changes import parse_change
 from igaussian_core.evaluate.metrics import by_group, plain, summarize
 from igaussian_core.evaluate.photos import PhotoQueries, extent, held_out_images
 from igaussian_core.evaluate.rendered import RenderedQueries, camera_of, shows_enough, targets
-from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.evaluate.runner import Queries, run
 from igaussian_core.map_package import MapPackage, NetworkData, read_tensors
 from igaussian_core.sphere import sphere_of
@@ -91,7 +90,7 @@ def main() -> None:
     options = parser.parse_args()
     options.work.mkdir(parents=True, exist_ok=True)
     tables = {"maps": maps_table, "ablation": ablation_table, "views": views_table}
-    report: dict[str, Any] = {"facts": {**machine_facts(), "commit": commit()}}
+    report: dict[str, Any] = {"facts": facts()}
     report["facts"]["training"] = (
         f"from the joint weights, {FOR_MEMORY.steps} steps of {FOR_MEMORY.episodes} times "
         f"{FOR_MEMORY.views} views for the memory, {FOR_HEADS_FROM_WEIGHTS.steps} of "

@@ -28,8 +28,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from _data import data_folder
+from _facts import facts
 from numpy.typing import NDArray
-from peers import commit
 from photos import CASES, compiled
 from tables import verdict
 
@@ -38,7 +38,6 @@ from igaussian_core.cli_tools import load_config
 from igaussian_core.compile_map import training_images
 from igaussian_core.evaluate.image_changes import Change
 from igaussian_core.evaluate.photos import extent, held_out_images
-from igaussian_core.evaluate.report import machine_facts
 from igaussian_core.geometry import pose_error
 from igaussian_core.localizer import Localizer
 from igaussian_core.posed_images import PosedImage, read_posed_images
@@ -110,7 +109,7 @@ def main() -> None:
             answers += [_answer(localizer, name, case, size) for case in cases]
             print(f"{name}: {sum(a.map == name for a in answers)} images", flush=True)
     report = {
-        "facts": {**machine_facts(), "commit": commit()}, "images": _by_kind(answers),
+        "facts": facts(), "images": _by_kind(answers),
         "answers": [asdict(a) for a in answers],
     }  # fmt: skip
     print(verdict(report))

@@ -60,10 +60,9 @@ def turned(
 ) -> NDArray[np.uint8]:
     """The image of the camera turned to T_scene_cam @ rotation; its edge goes on where it saw
     nothing."""
-    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     return np.asarray(
         cv2.warpPerspective(
-            image, K @ rotation.T @ np.linalg.inv(K), (camera.width, camera.height),
+            image, camera.K @ rotation.T @ np.linalg.inv(camera.K), (camera.width, camera.height),
             borderMode=cv2.BORDER_REPLICATE,
         ),
         np.uint8,

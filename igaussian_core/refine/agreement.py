@@ -34,9 +34,9 @@ def plane_homography(
         T_image_render: between their cameras, 4x4; a few pixels apart.
         depth: of the plane in the render.
     """
-    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     R, t = T_image_render[:3, :3], T_image_render[:3, 3]
-    return np.asarray(K @ (R + np.outer(t, (0, 0, 1 / max(depth, 1e-9)))) @ np.linalg.inv(K))
+    across = R + np.outer(t, (0, 0, 1 / max(depth, 1e-9)))
+    return np.asarray(camera.K @ across @ np.linalg.inv(camera.K))
 
 
 def seen_through(H: NDArray[np.float64], image: Gray) -> Gray:
